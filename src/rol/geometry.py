@@ -1,0 +1,270 @@
+"""Poses in the plane and in space: compose, invert, apply, interpolate.
+
+A 2D pose is an array whose last axis holds ``(x, y, yaw)`` in metres and radians; x points forward, y left, and yaw
+turns counter-clockwise. A pose named ``T_a_b`` maps points of frame ``b`` into frame ``a``; it is at the same time the
+pose of ``b`` as seen from ``a``. A 3D transform is a 4 x 4 matrix with the same naming.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+
+def wrap_angle(angle: np.ndarray | float) -> np.ndarray | float:
+    """Wrap an angle to the half-open interval [-pi, pi).
+
+    Parameters
+    ----------
+    angle : float or array, any shape
+        Angle [rad].
+
+    Returns
+    -------
+    wrapped : float or array, same shape
+        The same direction in [-pi, pi) [rad].
+    """
+    return (angle + np.pi) % (2.0 * np.pi) - np.pi
+
+
+def check_poses(poses: np.ndarray, name: str = "poses") -> np.ndarray:
+    """Check that an array holds finite 2D poses.
+
+    Parameters
+    ----------
+    poses : array-like, shape (..., 3)
+        Poses (x, y, yaw) [m, m, rad].
+    name : str
+        What the array is called in the message.
+
+    Returns
+    -------
+    poses : array, shape (..., 3)
+        The same values as float64.
+
+    Raises
+    ------
+    ValueError
+        If the last axis is not 3 or a value is not finite.
+    """
+    poses = np.asarray(poses, dtype=np.float64)
+    if poses.ndim == 0 or poses.shape[-1] != 3:
+        raise ValueError(f"{name}: expected shape (..., 3) for (x, y, yaw), got {poses.shape}")
+    if not np.isfinite(poses).all():
+        first = np.argwhere(~np.isfinite(poses))[0]
+        raise ValueError(f"{name}: value at index {tuple(int(i) for i in first)} is not finite")
+    return poses
+
+
+def compose(T_a_b: np.ndarray, T_b_c: np.ndarray) -> np.ndarray:
+    """Chain two poses: the pose of c in a.
+
+    Parameters
+    ----------
+    T_a_b, T_b_c : array, shape (..., 3)
+        Poses (x, y, yaw) [m, m, rad]; leading axes broadcast.
+
+    Returns
+    -------
+    T_a_c : array, shape (..., 3)
+        The chained pose, yaw in [-pi, pi).
+    """
+    a, b = np.asarray(T_a_b, dtype=np.float64), np.asarray(T_b_c, dtype=np.float64)
+    c, s = np.cos(a[..., 2]), np.sin(a[..., 2])
+    x = a[..., 0] + c * b[..., 0] - s * b[..., 1]
+    y = a[..., 1] + s * b[..., 0] + c * b[..., 1]
+    return np.stack([x, y, wrap_angle(a[..., 2] + b[..., 2])], axis=-1)
+
+
+def invert(T_a_b: np.ndarray) -> np.ndarray:
+    """Invert a pose.
+
+    Parameters
+    ----------
+    T_a_b : array, shape (..., 3)
+        Pose (x, y, yaw) [m, m, rad].
+
+    Returns
+    -------
+    T_b_a : array, shape (..., 3)
+        The inverse, such that ``compose(T_a_b, T_b_a)`` is zero.
+    """
+    a = np.asarray(T_a_b, dtype=np.float64)
+    c, s = np.cos(a[..., 2]), np.sin(a[..., 2])
+    x = -c * a[..., 0] - s * a[..., 1]
+    y = s * a[..., 0] - c * a[..., 1]
+    return np.stack([x, y, wrap_angle(-a[..., 2])], axis=-1)
+
+
+def relative_pose(T_w_a: np.ndarray, T_w_b: np.ndarray) -> np.ndarray:
+    """Give the pose of b as seen from a.
+
+    Parameters
+    ----------
+    T_w_a, T_w_b : array, shape (..., 3)
+        Two poses in one frame [m, m, rad]; leading axes broadcast.
+
+    Returns
+    -------
+    T_a_b : array, shape (..., 3)
+        ``compose(invert(T_w_a), T_w_b)``.
+    """
+    return compose(invert(T_w_a), T_w_b)
+
+
+def accumulate_steps(steps: np.ndarray, start: np.ndarray | tuple[float, float, float] = (0.0, 0.0, 0.0)) -> np.ndarray:
+    """Chain body-frame steps into a trajectory.
+
+    Parameters
+    ----------
+    steps : array, shape (n, 3)
+        Step i is the pose of frame i + 1 in frame i (x, y, yaw) [m, m, rad].
+    start : array-like, shape (3,)
+        Pose of frame 0 [m, m, rad].
+
+    Returns
+    -------
+    poses : array, shape (n + 1, 3)
+        Pose of every frame, the start first; yaw in [-pi, pi).
+    """
+    steps = check_poses(np.asarray(steps, dtype=np.float64).reshape(-1, 3), "steps")
+    x0, y0, yaw0 = check_poses(start, "start")
+    yaws = yaw0 + np.concatenate([[0.0], np.cumsum(steps[:, 2])])
+    c, s = np.cos(yaws[:-1]), np.sin(yaws[:-1])
+    x = x0 + np.concatenate([[0.0], np.cumsum(c * steps[:, 0] - s * steps[:, 1])])
+    y = y0 + np.concatenate([[0.0], np.cumsum(s * steps[:, 0] + c * steps[:, 1])])
+    return np.stack([x, y, wrap_angle(yaws)], axis=-1)
+
+
+def transform_points(T_a_b: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Map 2D points from frame b into frame a.
+
+    Parameters
+    ----------
+    T_a_b : array, shape (3,)
+        Pose of b in a (x, y, yaw) [m, m, rad].
+    points : array, shape (n, 2)
+        Points in frame b [m].
+
+    Returns
+    -------
+    points : array, shape (n, 2)
+        The same points in frame a [m].
+    """
+    x, y, yaw = T_a_b
+    c, s = np.cos(yaw), np.sin(yaw)
+    return np.asarray(points, dtype=np.float64) @ np.array([[c, s], [-s, c]]) + (x, y)
+
+
+def interpolate_poses(stamps_us: np.ndarray, poses: np.ndarray, query_us: np.ndarray) -> np.ndarray:
+    """Interpolate poses linearly in time, headings the short way round.
+
+    Parameters
+    ----------
+    stamps_us : array, shape (n,)
+        Strictly increasing times of the poses [us].
+    poses : array, shape (n, 3)
+        Poses at these times (x, y, yaw) [m, m, rad].
+    query_us : array, shape (m,)
+        Times asked for [us].
+
+    Returns
+    -------
+    poses : array, shape (m, 3)
+        Poses at the times asked for; yaw in [-pi, pi).
+
+    Raises
+    ------
+    ValueError
+        If times do not increase, lengths differ, or a query lies outside the span of the poses.
+    """
+    stamps_us, query_us = np.asarray(stamps_us, dtype=np.int64), np.asarray(query_us, dtype=np.int64)
+    poses = check_poses(poses)
+    if len(stamps_us) != len(poses) or len(poses) == 0:
+        raise ValueError(f"{len(stamps_us)} stamps for {len(poses)} poses")
+    if (np.diff(stamps_us) <= 0).any():
+        raise ValueError(f"stamps do not increase at index {int(np.argmax(np.diff(stamps_us) <= 0)) + 1}")
+    outside = (query_us < stamps_us[0]) | (query_us > stamps_us[-1])
+    if outside.any():
+        raise ValueError(
+            f"time {int(query_us[outside][0])} us lies outside the poses' span {stamps_us[0]} .. {stamps_us[-1]} us"
+        )
+    t, knots = (query_us - stamps_us[0]).astype(float), (stamps_us - stamps_us[0]).astype(float)
+    yaws = np.unwrap(poses[:, 2])
+    x, y, yaw = (np.interp(t, knots, values) for values in (poses[:, 0], poses[:, 1], yaws))
+    return np.stack([x, y, wrap_angle(yaw)], axis=-1)
+
+
+def rotation_from_euler(roll: float, pitch: float, yaw: float) -> np.ndarray:
+    """Build the rotation matrix Rz(yaw) Ry(pitch) Rx(roll).
+
+    Parameters
+    ----------
+    roll, pitch, yaw : float
+        Angles about x, y and z [rad].
+
+    Returns
+    -------
+    R : array, shape (3, 3)
+        Rotation matrix.
+    """
+    (cr, sr), (cp, sp), (cy, sy) = ((np.cos(a), np.sin(a)) for a in (roll, pitch, yaw))
+    Rz = np.array([[cy, -sy, 0.0], [sy, cy, 0.0], [0.0, 0.0, 1.0]])
+    Ry = np.array([[cp, 0.0, sp], [0.0, 1.0, 0.0], [-sp, 0.0, cp]])
+    Rx = np.array([[1.0, 0.0, 0.0], [0.0, cr, -sr], [0.0, sr, cr]])
+    return Rz @ Ry @ Rx
+
+
+def transform_from_euler(x: float, y: float, z: float, roll: float, pitch: float, yaw: float) -> np.ndarray:
+    """Build a 4 x 4 transform from a translation and Euler angles.
+
+    Parameters
+    ----------
+    x, y, z : float
+        Translation [m].
+    roll, pitch, yaw : float
+        Angles of Rz(yaw) Ry(pitch) Rx(roll) [rad].
+
+    Returns
+    -------
+    T : array, shape (4, 4)
+        Homogeneous transform.
+    """
+    T = np.eye(4)
+    T[:3, :3] = rotation_from_euler(roll, pitch, yaw)
+    T[:3, 3] = x, y, z
+    return T
+
+
+def transform_points_3d(T_a_b: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Map 3D points from frame b into frame a.
+
+    Parameters
+    ----------
+    T_a_b : array, shape (4, 4)
+        Homogeneous transform.
+    points : array, shape (n, 3)
+        Points in frame b [m].
+
+    Returns
+    -------
+    points : array, shape (n, 3)
+        The same points in frame a [m].
+    """
+    return points @ T_a_b[:3, :3].T + T_a_b[:3, 3]
+
+
+def flip_y_z(T: np.ndarray) -> np.ndarray:
+    """Turn a 3D transform between y-right z-down frames into y-left z-up frames, or back.
+
+    Parameters
+    ----------
+    T : array, shape (4, 4)
+        Transform between two frames of one convention.
+
+    Returns
+    -------
+    T : array, shape (4, 4)
+        The same motion between the same two frames in the other convention.
+    """
+    F = np.diag([1.0, -1.0, -1.0, 1.0])
+    return F @ T @ F
