@@ -35,7 +35,9 @@ def paint_table() -> np.ndarray:
     return table
 
 
-def plan_rays(centre: np.ndarray, half_m: float, pixel_m: float, height: float = 60.0) -> tuple[np.ndarray, tuple[int, int]]:
+def plan_rays(
+    centre: np.ndarray, half_m: float, pixel_m: float, height: float = 60.0
+) -> tuple[np.ndarray, tuple[int, int]]:
     """Aim rays straight down on a grid of places.
 
     Parameters
@@ -85,7 +87,9 @@ def view_rays(
         (rows, width).
     """
     focal = 0.5 * width / np.tan(0.5 * opening)
-    left, up = np.meshgrid((0.5 * width - 0.5 - np.arange(width)) / focal, (0.45 * rows - np.arange(rows)) / focal)
+    left, up = np.meshgrid(
+        (0.5 * width - 0.5 - np.arange(width)) / focal, (0.45 * rows - np.arange(rows)) / focal
+    )
     c, s = np.cos(pose[2]), np.sin(pose[2])
     directions = np.stack([c - s * left, s + c * left, up], axis=-1).reshape(-1, 3)
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
