@@ -1,0 +1,514 @@
+"""The translator room: the networks of pix2pix, their losses, one training step, use, weights as files.
+
+Images are tensors of shape (b, 1, h, w) in [-1, 1]: -1 is empty (pixel 0), +1 is occupied (pixel 255). Row 0
+is the farthest forward, column 0 the farthest left. The architecture is that of the public pix2pix and
+CycleGAN code with one channel in and one channel out (Yin et al. 2020, Sec. III-A, Eq. 2-5, and Sec. IV-A).
+This is the only room that imports torch when it is itself imported; `rol.training` holds the loop.
+
+Batch norm takes the statistics of the images it is given, in training and in use alike, and keeps no running
+ones. The public code does so too when it is used as its authors use it, and with one image per batch the
+network is then one and the same function in training and in use. So `generate` handles one image at a time.
+There is no dropout: nothing is drawn after the first weights but the order of the pairs.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from contextlib import nullcontext
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+from torch import Tensor, nn
+from torch.nn import functional
+
+ARCHITECTURE = "resnet-generator, batch statistics, 1 to 1 channel"
+
+
+class Pix2PixError(ValueError):
+    """An image, a loss or a file of weights that cannot be used; the message names it and the fault."""
+
+
+@dataclass(frozen=True)
+class TrainConfig:
+    """Settings of one training run; the defaults are the paper's, or the public code's where it is silent."""
+
+    filters: int = 64  # width of the generator's first layer; public default
+    blocks: int = 9  # residual blocks; Sec. IV-A, "ResNet with 9 blocks"
+    discriminator_filters: int = 64  # width of the discriminator's first layer; public default
+    epochs: int = 200  # passes over the pairs, half at full rate and half decaying; public default 100 + 100
+    steps: int = (
+        0  # 0: as many as the epochs need; otherwise this many optimiser steps and `epochs` is not read
+    )
+    batch: int = 1  # public default; batch statistics are then those of one image, as in use
+    lambda_l1: float = 100.0  # lambda of Eq. 2; the paper gives no value, public default
+    l1_occupied_weight: float = 1.0  # 1: Eq. 4 as printed; above 1, L1 counts occupied pixels so many times
+    learning_rate: float = 2e-4  # Adam; public default
+    beta1: float = (
+        0.5  # Adam; public default, lower than Adam's own 0.9 because the two losses chase each other
+    )
+    beta2: float = 0.999  # Adam; public default
+    bf16: bool = (
+        False  # True: multiply in bfloat16; quicker only where the processor or GPU has such instructions
+    )
+    report_every: int = 50  # steps per row of the history, each with a look at the held-out pairs
+    checkpoint_every: int = 500  # steps between checkpoints, a multiple of the above: minutes lost at most
+
+    def n_steps(self, n_pairs: int) -> int:
+        """Give the number of optimiser steps for a data set of `n_pairs` pairs."""
+        return self.steps or self.epochs * -(-n_pairs // self.batch)
+
+
+def _norm(channels: int) -> nn.BatchNorm2d:
+    return nn.BatchNorm2d(channels, track_running_stats=False)
+
+
+class ResidualBlock(nn.Module):
+    """Two 3 x 3 convolutions beside a shortcut; shape (b, c, h, w) in and out."""
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        layers: list[nn.Module] = []
+        for is_last in (False, True):  # no bias: the norm that follows would cancel it
+            layers += [nn.ReflectionPad2d(1), nn.Conv2d(channels, channels, 3, bias=False), _norm(channels)]
+            layers += [] if is_last else [nn.ReLU(inplace=True)]
+        self.layers = nn.Sequential(*layers)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Return the input plus what the block has learnt to add."""
+        return x + self.layers(x)  # (b, c, h, w)
+
+
+class ResnetGenerator(nn.Module):
+    """Generator G: 7 x 7, two halvings, residual blocks, two doublings, 7 x 7, tanh.
+
+    Attributes
+    ----------
+    filters, blocks : int
+        Width of the first layer and number of residual blocks.
+    image_size : tuple of int or None
+        Height and width it was trained on; ``generate`` refuses any other. None: not trained yet.
+    """
+
+    def __init__(self, filters: int, blocks: int) -> None:
+        super().__init__()
+        if filters < 1 or blocks < 0:
+            raise Pix2PixError(
+                f"generator: filters must be at least 1 and blocks at least 0, got {filters}, {blocks}"
+            )
+        self.filters, self.blocks, self.image_size = filters, blocks, None
+        f = filters
+        layers: list[nn.Module] = [
+            nn.ReflectionPad2d(3),
+            nn.Conv2d(1, f, 7, bias=False),
+            _norm(f),
+            nn.ReLU(True),
+        ]
+        for c in (f, 2 * f):
+            layers += [nn.Conv2d(c, 2 * c, 3, stride=2, padding=1, bias=False), _norm(2 * c), nn.ReLU(True)]
+        layers += [ResidualBlock(4 * f) for _ in range(blocks)]
+        for c in (4 * f, 2 * f):
+            up = nn.ConvTranspose2d(c, c // 2, 3, stride=2, padding=1, output_padding=1, bias=False)
+            layers += [up, _norm(c // 2), nn.ReLU(True)]
+        layers += [nn.ReflectionPad2d(3), nn.Conv2d(f, 1, 7), nn.Tanh()]
+        self.layers = nn.Sequential(*layers)
+
+    def forward(self, radar: Tensor) -> Tensor:
+        """Map radar images to fake lidar images."""
+        return self.layers(radar)  # (b, 1, h, w) -> (b, 1, h, w)
+
+
+def _initialise(network: nn.Module, rng: torch.Generator) -> nn.Module:
+    """Fill a network built on the meta device with pix2pix's first weights, drawn from `rng` alone."""
+    network.to_empty(device="cpu")
+    for module in network.modules():
+        if isinstance(module, nn.Conv2d | nn.ConvTranspose2d | nn.BatchNorm2d):
+            mean = 1.0 if isinstance(module, nn.BatchNorm2d) else 0.0
+            nn.init.normal_(module.weight, mean, 0.02, generator=rng)
+            if module.bias is not None:
+                nn.init.zeros_(module.bias)
+    return network.to(memory_format=torch.channels_last)  # about a fifth quicker on a CPU
+
+
+def build_generator(filters: int = 64, blocks: int = 9, *, rng: torch.Generator) -> ResnetGenerator:
+    """Build the generator with freshly drawn weights.
+
+    Parameters
+    ----------
+    filters : int
+        Width of the first layer; 64 is the paper's, the cost grows with its square.
+    blocks : int
+        Residual blocks; 9 in the paper.
+    rng : torch.Generator
+        Source of the weights, N(0, 0.02) as in pix2pix.
+
+    Returns
+    -------
+    generator : ResnetGenerator
+        Maps (b, 1, h, w) to (b, 1, h, w), both in [-1, 1]; h and w must be multiples of 4.
+    """
+    with torch.device("meta"):  # no weights drawn from torch's global state
+        network = ResnetGenerator(filters, blocks)
+    return _initialise(network, rng)
+
+
+def build_discriminator(filters: int = 64, *, rng: torch.Generator) -> nn.Sequential:
+    """Build the 70 x 70 PatchGAN discriminator with freshly drawn weights.
+
+    Parameters
+    ----------
+    filters : int
+        Width of the first layer.
+    rng : torch.Generator
+        Source of the weights, N(0, 0.02) as in pix2pix.
+
+    Returns
+    -------
+    discriminator : torch.nn.Sequential
+        Maps radar and lidar image stacked (b, 2, h, w) to one logit per patch of 70 x 70 pixels,
+        (b, 1, h / 8 - 2, w / 8 - 2).
+    """
+    f = filters
+    with torch.device("meta"):
+        layers: list[nn.Module] = [nn.Conv2d(2, f, 4, stride=2, padding=1), nn.LeakyReLU(0.2, True)]
+        for c, stride in ((f, 2), (2 * f, 2), (4 * f, 1)):
+            layers += [nn.Conv2d(c, 2 * c, 4, stride, 1, bias=False), _norm(2 * c), nn.LeakyReLU(0.2, True)]
+        network = nn.Sequential(*layers, nn.Conv2d(8 * f, 1, 4, stride=1, padding=1))
+    return _initialise(network, rng)
+
+
+def receptive_field(network: nn.Module) -> int:
+    """Work out how many pixels of the input, along an edge, one output of a chain of convolutions sees.
+
+    Parameters
+    ----------
+    network : torch.nn.Module
+        Convolutions one after the other, none of them transposed; what lies between them is not counted, so
+        not the statistics of batch norm, which come from the whole image.
+
+    Returns
+    -------
+    size : int
+        Edge of the receptive field [pixels]; 70 for `build_discriminator`.
+    """
+    size, jump = 1, 1  # pixels seen by one output, and pixels between two neighbouring outputs
+    for module in network.modules():
+        if isinstance(module, nn.Conv2d):
+            size += (module.kernel_size[0] - 1) * jump
+            jump *= module.stride[0]
+    return size
+
+
+def gan_loss(logits: Tensor, is_real: bool) -> Tensor:
+    """Score logits against one answer for all patches: binary cross-entropy, one term of Eq. 3.
+
+    Parameters
+    ----------
+    logits : tensor, any shape
+        What the discriminator says before the sigmoid.
+    is_real : bool
+        The answer it is held against.
+
+    Returns
+    -------
+    loss : tensor, shape ()
+        ``-log D`` if `is_real`, else ``-log(1 - D)``, mean over patches.
+    """
+    return functional.binary_cross_entropy_with_logits(logits, torch.full_like(logits, float(is_real)))
+
+
+def l1_loss(fake: Tensor, lidar: Tensor, occupied_weight: float = 1.0) -> Tensor:
+    """Measure the mean absolute difference of two images, Eq. 4.
+
+    Parameters
+    ----------
+    fake, lidar : tensor, shape (b, 1, h, w)
+        Generated and real image in [-1, 1].
+    occupied_weight : float
+        How many times a pixel counts that is occupied in the real image; 1 is the paper's.
+
+    Returns
+    -------
+    loss : tensor, shape ()
+        Mean over all pixels; in [0, 2] for a weight of 1.
+    """
+    difference = (fake - lidar).abs()
+    if occupied_weight != 1.0:
+        difference = difference * (1.0 + (occupied_weight - 1.0) * (lidar > 0))
+    return difference.mean()
+
+
+def train_step(
+    generator: nn.Module,
+    discriminator: nn.Module,
+    optimizer_g: torch.optim.Optimizer,
+    optimizer_d: torch.optim.Optimizer,
+    radar: Tensor,
+    lidar: Tensor,
+    config: TrainConfig,
+) -> dict[str, float]:
+    """Update the discriminator, then the generator against the frozen discriminator (changes both in place).
+
+    Parameters
+    ----------
+    generator, discriminator : torch.nn.Module
+        The two networks.
+    optimizer_g, optimizer_d : torch.optim.Optimizer
+        Their optimisers.
+    radar, lidar : tensor, shape (b, 1, h, w)
+        A batch of pairs in [-1, 1].
+    config : TrainConfig
+        Read: `lambda_l1`, `l1_occupied_weight`, `bf16`.
+
+    Returns
+    -------
+    losses : dict of float
+        ``loss_d`` (half the sum of its two terms), ``loss_gan``, ``loss_l1`` (Eq. 4, without lambda and
+        weight).
+
+    Raises
+    ------
+    Pix2PixError
+        If a loss is not finite; the weights are then not updated by it.
+
+    Notes
+    -----
+    Yin et al. 2020, Sec. III-A, Eq. 2-4. As in the public code the generator maximises log D(fake) instead of
+    minimising log(1 - D(fake)): the same aim with a stronger slope while the fakes are still poor.
+    """
+    autocast = torch.autocast(radar.device.type, torch.bfloat16) if config.bf16 else nullcontext()
+    with autocast:
+        fake = generator(radar)  # (b, 1, h, w)
+
+        discriminator.requires_grad_(True)
+        loss_fake = gan_loss(discriminator(torch.cat([radar, fake.detach()], 1)).float(), False)
+        loss_real = gan_loss(discriminator(torch.cat([radar, lidar], 1)).float(), True)
+        loss_d = 0.5 * (loss_fake + loss_real)  # halved as in pix2pix: D learns more slowly than G
+    _descend(optimizer_d, loss_d, "discriminator loss")
+
+    discriminator.requires_grad_(False)
+    with autocast:
+        loss_gan = gan_loss(discriminator(torch.cat([radar, fake], 1)).float(), True)
+    fake = fake.float()
+    weighted = l1_loss(fake, lidar, config.l1_occupied_weight)
+    _descend(optimizer_g, loss_gan + config.lambda_l1 * weighted, "generator loss")
+    losses = {"loss_d": loss_d, "loss_gan": loss_gan, "loss_l1": l1_loss(fake, lidar)}
+    return {name: float(loss.detach()) for name, loss in losses.items()}
+
+
+def _descend(optimizer: torch.optim.Optimizer, loss: Tensor, name: str) -> None:
+    """Take one optimiser step down a loss, or refuse if the loss is not finite."""
+    if not torch.isfinite(loss.detach()):
+        raise Pix2PixError(f"{name} is {float(loss.detach())}")
+    optimizer.zero_grad(set_to_none=True)
+    loss.backward()
+    optimizer.step()
+
+
+def evaluate_l1(generator: ResnetGenerator, pairs: Any) -> float:
+    """Measure Eq. 4 on pairs that are not learnt from.
+
+    Parameters
+    ----------
+    generator : ResnetGenerator
+        The network.
+    pairs : sequence of (radar, lidar), each array float32 (1, h, w) in [-1, 1]
+        The pairs.
+
+    Returns
+    -------
+    l1 : float
+        Mean absolute difference in [0, 2]; nan without pairs.
+    """
+    device, losses = next(generator.parameters()).device, []
+    with torch.inference_mode():
+        for index in range(len(pairs)):
+            radar, lidar = (torch.from_numpy(image[None]).to(device) for image in pairs[index])
+            losses.append(float(l1_loss(generator(radar), lidar)))
+    return float(np.mean(losses)) if losses else float("nan")
+
+
+def to_tensor(image: np.ndarray) -> Tensor:
+    """Turn a grey image into a tensor: 0 becomes -1, 255 becomes +1.
+
+    Parameters
+    ----------
+    image : array, shape (h, w), uint8
+        Grey image.
+
+    Returns
+    -------
+    tensor : tensor, shape (1, 1, h, w), float32
+        The same in [-1, 1].
+    """
+    return torch.from_numpy(image[None, None].astype(np.float32) / np.float32(127.5) - np.float32(1.0))
+
+
+def generate(generator: ResnetGenerator, radar_image: np.ndarray, *, bf16: bool = False) -> np.ndarray:
+    """Turn a radar image into a fake lidar image.
+
+    The same network gives the same image whether it is in training or evaluation mode: batch norm takes the
+    statistics of this one image, there is no dropout, and nothing in the network changes.
+
+    Parameters
+    ----------
+    generator : ResnetGenerator
+        The trained network.
+    radar_image : array, shape (h, w), uint8
+        Power image of one scan; h and w multiples of 4, and those the network was trained on.
+    bf16 : bool
+        Multiply in bfloat16.
+
+    Returns
+    -------
+    fake_image : array, shape (h, w), uint8
+        0 empty to 255 occupied.
+
+    Raises
+    ------
+    Pix2PixError
+        If the image has another type, shape or size.
+
+    Notes
+    -----
+    Yin et al. 2020, Eq. 5.
+    """
+    if radar_image.dtype != np.uint8 or radar_image.ndim != 2:
+        raise Pix2PixError(f"radar image: expected uint8 (h, w), got {radar_image.dtype} {radar_image.shape}")
+    check_size(radar_image.shape, generator.image_size, "radar image")
+    device = next(generator.parameters()).device
+    autocast = torch.autocast(device.type, torch.bfloat16) if bf16 else nullcontext()
+    with torch.inference_mode(), autocast:
+        fake = generator(to_tensor(radar_image).to(device))[0, 0]  # (h, w)
+    return torch.round((fake.float() + 1.0) * 127.5).to(torch.uint8).cpu().numpy()
+
+
+def check_size(size: tuple[int, ...], expected: tuple[int, int] | None, name: str) -> None:
+    """Refuse image sizes the network cannot give back, or was not trained on."""
+    if any(n % 4 or n < 16 for n in size):
+        raise Pix2PixError(f"{name}: height and width must be multiples of 4 from 16 on, got {tuple(size)}")
+    if expected is not None and tuple(size) != tuple(expected):
+        raise Pix2PixError(f"{name}: size {tuple(size)}, but the generator was trained on {tuple(expected)}")
+
+
+def save_weights(
+    path: str | Path, generator: ResnetGenerator, metadata: dict[str, Any] | None = None
+) -> None:
+    """Write a generator with what is needed to build it again, atomically.
+
+    Parameters
+    ----------
+    path : path
+        File to write, ``*.safetensors``.
+    generator : ResnetGenerator
+        The network.
+    metadata : dict, optional
+        More to put into the header, JSON values only (seed, settings, session ...).
+    """
+    about = {
+        "architecture": ARCHITECTURE,
+        "filters": generator.filters,
+        "blocks": generator.blocks,
+        "image_size": generator.image_size,
+        "torch": str(torch.__version__),
+    }
+    save_tensors(Path(path), dict(generator.state_dict()), {**(metadata or {}), **about})
+
+
+def load_weights(
+    path: str | Path, *, filters: int | None = None, blocks: int | None = None
+) -> ResnetGenerator:
+    """Build a generator from a file of `save_weights`.
+
+    Parameters
+    ----------
+    path : path
+        The file.
+    filters, blocks : int, optional
+        Refuse a network of another width or depth; not given: take what the file holds.
+
+    Returns
+    -------
+    generator : ResnetGenerator
+        The network with its weights, on the CPU.
+
+    Raises
+    ------
+    Pix2PixError
+        If the file is missing, truncated, of another architecture, width, depth, or does not hold the weights
+        that its header promises; the message names the file.
+    """
+    tensors, about = load_tensors(Path(path))
+    if about.get("architecture") != ARCHITECTURE:
+        raise Pix2PixError(f"{path}: architecture {about.get('architecture')!r}, expected {ARCHITECTURE!r}")
+    for name, wanted in (("filters", filters), ("blocks", blocks)):
+        if wanted is not None and about[name] != wanted:
+            raise Pix2PixError(f"{path}: generator with {about[name]} {name}, expected {wanted}")
+    generator = build_generator(about["filters"], about["blocks"], rng=torch.Generator())
+    try:
+        generator.load_state_dict(tensors)
+    except RuntimeError as error:
+        raise Pix2PixError(f"{path}: tensors do not fit the header's architecture ({error})") from error
+    generator.image_size = None if about["image_size"] is None else tuple(about["image_size"])
+    return generator
+
+
+def load_metadata(path: str | Path) -> dict[str, Any]:
+    """Read the header of a weights file: architecture, sizes, seed, settings, versions.
+
+    Parameters
+    ----------
+    path : path
+        File of `save_weights`.
+
+    Returns
+    -------
+    metadata : dict
+        What the header holds.
+    """
+    return load_tensors(Path(path))[1]
+
+
+def save_tensors(path: Path, tensors: dict[str, Tensor], about: dict[str, Any]) -> None:
+    """Write tensors and a header under a temporary name, then rename.
+
+    Parameters
+    ----------
+    path : path
+        File to write.
+    tensors : dict of tensor
+        Named tensors, no pickle.
+    about : dict
+        Header, JSON values only.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    plain = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
+    save_file(plain, temporary, {"rol": json.dumps(about, sort_keys=True)})
+    os.replace(temporary, path)
+
+
+def load_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
+    """Read the tensors and the header of a file of `save_tensors`.
+
+    Raises
+    ------
+    Pix2PixError
+        If the file is missing, not whole, or written by something else.
+    """
+    if not path.is_file():
+        raise Pix2PixError(f"{path}: no such weights file")
+    try:
+        with safe_open(path, "pt") as file:
+            about = (file.metadata() or {}).get("rol")
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (no mapping)
+    except (SafetensorError, OSError) as error:
+        raise Pix2PixError(f"{path}: not a whole safetensors file ({error})") from error
+    if about is None:
+        raise Pix2PixError(f"{path}: header says nothing of the network, so not written by rol.pix2pix")
+    return tensors, json.loads(about)

@@ -1,0 +1,274 @@
+"""The training room: the loop around `rol.pix2pix.train_step`, its history, and checkpoints to go on from.
+
+Nothing here is remembered but in the checkpoint: the order of the pairs and the learning rate follow from the
+seed and the number of the step. So a run that was stopped goes on to the very losses of one that was not.
+"""
+
+from __future__ import annotations
+
+import os
+import zlib
+from collections.abc import Callable
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pandas as pd
+
+if TYPE_CHECKING:
+    from .pix2pix import ResnetGenerator, TrainConfig
+
+HISTORY_COLUMNS = ["step", "epoch", "learning_rate", "loss_d", "loss_gan", "loss_l1", "held_out_l1"]
+
+
+class TrainingError(ValueError):
+    """A training run that cannot start, go on or continue; the message says why."""
+
+
+class TrainingState:
+    """Everything that changes during training: two networks, two optimisers, the step, the history.
+
+    Parameters
+    ----------
+    config : TrainConfig
+        Widths and Adam's settings.
+    seed : int
+        Seed of the first weights.
+    device : str
+        Where the networks lie.
+    """
+
+    def __init__(self, config: TrainConfig, seed: int, device: str = "cpu") -> None:
+        import torch
+
+        from .pix2pix import build_discriminator, build_generator
+
+        rng = torch.Generator().manual_seed(seed)
+        generator = build_generator(config.filters, config.blocks, rng=rng)
+        discriminator = build_discriminator(config.discriminator_filters, rng=rng)
+        self.networks = {"generator": generator.to(device), "discriminator": discriminator.to(device)}
+        betas = (config.beta1, config.beta2)
+        self.optimizers = {
+            name: torch.optim.Adam(network.parameters(), config.learning_rate, betas)
+            for name, network in self.networks.items()
+        }
+        self.step = 0
+        self.history: list[dict[str, float]] = []
+
+    def save(self, path: Path, about: dict[str, Any]) -> None:
+        """Write weights and Adam's state as tensors and the scalars as JSON into one file, atomically."""
+        from .pix2pix import save_tensors
+
+        tensors = {}
+        for name, network in self.networks.items():
+            tensors |= {f"{name}.{key}": value for key, value in network.state_dict().items()}
+            for index, state in self.optimizers[name].state_dict()["state"].items():
+                tensors |= {f"adam.{name}.{index}.{key}": value for key, value in state.items()}
+        save_tensors(path, tensors, {**about, "step": self.step, "history": self.history})
+
+    def load(self, path: Path, about: dict[str, Any]) -> None:
+        """Go back to a checkpoint of the same run; refuse the checkpoint of another."""
+        from .pix2pix import load_tensors
+
+        tensors, found = load_tensors(path)
+        for name, (then, now) in _differences(found, about).items():
+            raise TrainingError(f"{path}: is of another run: {name} was {then}, now {now}")
+        for name, network in self.networks.items():
+            network.load_state_dict({key: tensors[f"{name}.{key}"] for key in network.state_dict()})
+            states = {}
+            for index, weight in enumerate(network.parameters()):
+                prefix = f"adam.{name}.{index}."
+                moments = {key: tensors[prefix + key] for key in ("exp_avg", "exp_avg_sq")}
+                # Laid out in memory like the weight: the same arithmetic, so the same bits.
+                moments = {key: weight.detach().clone().copy_(value) for key, value in moments.items()}
+                states[index] = {"step": tensors[prefix + "step"], **moments}
+            optimizer = self.optimizers[name]
+            optimizer.load_state_dict({**optimizer.state_dict(), "state": states})
+        self.step, self.history = found["step"], found["history"]
+
+
+def learning_rate(step: int, n_steps: int, first: float) -> float:
+    """Give the learning rate of a step: constant in the first half, then down to zero in a straight line.
+
+    Parameters
+    ----------
+    step : int
+        Number of the step, from 0.
+    n_steps : int
+        Steps of the whole run.
+    first : float
+        Rate of the first half.
+
+    Returns
+    -------
+    rate : float
+        Rate of this step, never 0.
+    """
+    return first * min(1.0, 2.0 * (1.0 - step / n_steps))
+
+
+def pick_pairs(step: int, n_pairs: int, batch: int, seed: int) -> np.ndarray:
+    """Give the pairs of a step; each epoch is a fresh shuffle that follows from seed and epoch alone.
+
+    Parameters
+    ----------
+    step : int
+        Number of the step, from 0.
+    n_pairs, batch : int
+        Pairs there are, and pairs per step; the last step of an epoch may have fewer.
+    seed : int
+        Seed of the run.
+
+    Returns
+    -------
+    index : array, shape (<= batch,)
+        Which pairs.
+    """
+    epoch, place = divmod(step, -(-n_pairs // batch))
+    order = np.random.default_rng([seed, epoch]).permutation(n_pairs)
+    return order[place * batch : (place + 1) * batch]
+
+
+def train(
+    dataset: Any,
+    config: TrainConfig,
+    out_dir: str | Path,
+    *,
+    seed: int,
+    held_out: Any = (),
+    resume: bool = True,
+    device: str = "cpu",
+    metadata: dict[str, Any] | None = None,
+    on_report: Callable[[dict[str, float], ResnetGenerator], None] | None = None,
+) -> tuple[ResnetGenerator, pd.DataFrame]:
+    """Train both networks; stop at any time and call again to go on from the last checkpoint.
+
+    On a CPU the same seed gives the same losses to the last bit, stopped or not, for one kind of processor
+    and one number of threads.
+
+    Parameters
+    ----------
+    dataset, held_out : sequence of (radar, lidar), each array float32 (1, h, w) in [-1, 1]
+        Pairs to learn from, and pairs that are only looked at.
+    config : TrainConfig
+        The settings.
+    out_dir : path
+        Gets ``generator.safetensors``, ``history.csv`` and ``checkpoint/last.safetensors``, each atomically.
+    seed : int
+        Seed of the first weights and of the order of the pairs.
+    resume : bool
+        False: a checkpoint that is there is not read, and is written over.
+    device : str
+        Where to compute, "cpu" or "cuda".
+    metadata : dict, optional
+        More for the header of the weights file, JSON values only.
+    on_report : callable, optional
+        Called with each new row of the history and the generator, to print or to keep samples.
+
+    Returns
+    -------
+    generator : ResnetGenerator
+        The trained network.
+    history : DataFrame
+        One row per ``report_every`` steps: means of the losses over them, and Eq. 4 on the held-out pairs.
+
+    Raises
+    ------
+    TrainingError
+        If there are no pairs, the settings contradict each other, the checkpoint is another run's, or a loss
+        is not finite.
+
+    Notes
+    -----
+    Yin et al. 2020, Sec. III-A and IV-A.
+    """
+    from .pix2pix import evaluate_l1, save_weights
+
+    size, n_steps = _check_run(dataset, config), config.n_steps(len(dataset))
+    folder, checkpoint = Path(out_dir), Path(out_dir) / "checkpoint" / "last.safetensors"
+    about = {"config": asdict(config), "seed": seed, "pairs": len(dataset), "data": _checksum(dataset)}
+    state = TrainingState(config, seed, device)
+    generator = state.networks["generator"]
+    generator.image_size = size
+    if resume and checkpoint.is_file():
+        state.load(checkpoint, about)
+    while state.step < n_steps:
+        row = _train_some(state, dataset, config, seed)
+        row["held_out_l1"] = evaluate_l1(generator, held_out)
+        state.history.append(row)
+        if on_report is not None:
+            on_report(row, generator)
+        if state.step % config.checkpoint_every == 0 or state.step == n_steps:
+            state.save(checkpoint, about)
+    history = pd.DataFrame(state.history, columns=HISTORY_COLUMNS)
+    temporary = folder / f".history.csv.{os.getpid()}.tmp"
+    history.to_csv(temporary, index=False)
+    os.replace(temporary, folder / "history.csv")
+    save_weights(
+        folder / "generator.safetensors", generator, {**(metadata or {}), **about, "step": state.step}
+    )
+    return generator, history
+
+
+def _train_some(state: TrainingState, dataset: Any, config: TrainConfig, seed: int) -> dict[str, float]:
+    """Take the steps of one row of the history and average their losses."""
+    import torch
+
+    from .pix2pix import Pix2PixError, train_step
+
+    n_pairs, losses = len(dataset), []
+    n_steps, device = config.n_steps(n_pairs), next(state.networks["generator"].parameters()).device
+    for step in range(state.step, min(state.step + config.report_every, n_steps)):
+        rate = learning_rate(step, n_steps, config.learning_rate)
+        for optimizer in state.optimizers.values():
+            optimizer.param_groups[0]["lr"] = rate
+        pairs = [dataset[int(index)] for index in pick_pairs(step, n_pairs, config.batch, seed)]
+        radar, lidar = (torch.from_numpy(np.stack(side)).to(device) for side in zip(*pairs, strict=True))
+        try:
+            losses.append(
+                train_step(*state.networks.values(), *state.optimizers.values(), radar, lidar, config)
+            )
+        except Pix2PixError as error:
+            raise TrainingError(
+                f"step {step + 1} of {n_steps}: {error}; checkpoints stay as they are"
+            ) from error
+        state.step = step + 1
+    means = {name: float(np.mean([loss[name] for loss in losses])) for name in losses[0]}
+    return {
+        "step": state.step,
+        "epoch": state.step / -(-n_pairs // config.batch),
+        "learning_rate": rate,
+        **means,
+    }
+
+
+def _check_run(dataset: Any, config: TrainConfig) -> tuple[int, int]:
+    """Refuse what cannot be trained on, and give the size of the images."""
+    from .pix2pix import check_size
+
+    if len(dataset) == 0:
+        raise TrainingError("no pairs to train on")
+    if min(config.batch, config.report_every, config.n_steps(len(dataset))) < 1:
+        raise TrainingError("batch, report_every and the number of steps must be at least 1")
+    if config.checkpoint_every % config.report_every:
+        every = (config.checkpoint_every, config.report_every)
+        raise TrainingError(f"checkpoint_every ({every[0]}) is no multiple of report_every ({every[1]})")
+    height, width = dataset[0][0].shape[-2:]
+    check_size((height, width), None, "first pair")
+    return int(height), int(width)
+
+
+def _checksum(dataset: Any) -> int:
+    """Tell one data set from another by its first and its last pair."""
+    ends = (0, len(dataset) - 1)
+    return zlib.crc32(b"".join(np.ascontiguousarray(image).tobytes() for i in ends for image in dataset[i]))
+
+
+def _differences(found: dict[str, Any], wanted: dict[str, Any]) -> dict[str, tuple[Any, Any]]:
+    """List what differs, settings by their own names: name to (found, wanted)."""
+    sides = [{**about, **(about.get("config") or {})} for about in (found, wanted)]
+    names = [name for name in sides[1] if name != "config"]
+    return {
+        name: (sides[0].get(name), sides[1][name]) for name in names if sides[0].get(name) != sides[1][name]
+    }
