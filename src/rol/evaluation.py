@@ -1,0 +1,400 @@
+"""Judging a localization run: errors, classes, failures, and the files that hold them.
+
+The measures of the paper's Tables II and III (Sec. IV-C): root mean square errors of position and heading,
+the shares of scans within three pairs of limits, and failures, for which the paper gives no rule and this
+file one with parameters. Trajectories are written in the TUM format, which ``evo`` reads.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+try:
+    from .geometry import check_poses, relative_pose
+except ImportError:  # this file was copied on its own
+    from geometry import check_poses, relative_pose
+
+CLASSES = ((1.0, 2.0), (2.0, 5.0), (5.0, 10.0))  # limits of Table III: position [m], heading [deg]
+
+
+class EvaluationError(ValueError):
+    """Raised for trajectories and files that cannot be judged; names the file and the fault."""
+
+
+@dataclass(frozen=True)
+class PoseErrors:
+    """Errors of estimated poses, per scan.
+
+    Attributes
+    ----------
+    position_m : array, shape (n,)
+        Distance between estimate and truth [m].
+    longitudinal_m, lateral_m : array, shape (n,)
+        Estimate ahead of (+) or behind the truth, and left (+) or right of it, in the true radar frame [m].
+    yaw_rad : array, shape (n,)
+        Estimated minus true heading in [-pi, pi) [rad].
+    """
+
+    position_m: np.ndarray
+    longitudinal_m: np.ndarray
+    lateral_m: np.ndarray
+    yaw_rad: np.ndarray
+
+
+def pose_errors(estimate: np.ndarray, truth: np.ndarray) -> PoseErrors:
+    """Compare estimated with true poses, scan by scan.
+
+    Parameters
+    ----------
+    estimate, truth : array, shape (n, 3)
+        Poses T_map_radar [m, m, rad].
+
+    Returns
+    -------
+    errors : PoseErrors
+
+    Raises
+    ------
+    EvaluationError
+        If the lengths differ or there is no pose.
+    """
+    estimate, truth = check_poses(estimate, "estimate"), check_poses(truth, "truth")
+    if estimate.shape != truth.shape or len(estimate) == 0:
+        raise EvaluationError(f"{len(estimate)} estimated poses for {len(truth)} true ones")
+    ahead, left, turned = relative_pose(truth, estimate).T
+    return PoseErrors(np.hypot(ahead, left), ahead, left, turned)
+
+
+def rmse(values: np.ndarray) -> float:
+    """Give the root mean square of errors.
+
+    Parameters
+    ----------
+    values : array, shape (n,)
+        Errors of any unit; n at least one.
+
+    Returns
+    -------
+    rmse : float
+        In the same unit.
+    """
+    return float(np.sqrt(np.mean(np.square(values))))
+
+
+def share_within(errors: PoseErrors, max_position_m: float, max_yaw_deg: float) -> float:
+    """Give the share of scans within both limits.
+
+    Parameters
+    ----------
+    errors : PoseErrors
+        From `pose_errors`.
+    max_position_m, max_yaw_deg : float
+        Limits of position [m] and heading [deg]; an error equal to a limit is outside.
+
+    Returns
+    -------
+    share : float
+        Between 0 and 1. Yin et al. 2020, Table III.
+    """
+    inside = (errors.position_m < max_position_m) & (np.abs(np.rad2deg(errors.yaw_rad)) < max_yaw_deg)
+    return float(np.mean(inside))
+
+
+@dataclass(frozen=True)
+class FailureRule:
+    """When a run counts as failed: too far off for too long.
+
+    The paper counts failures without saying what one is. Beyond 20 m another street's walls lie nearer than
+    the right ones, and with the heading 45 deg off no street fits, so a filter comes back only by luck; a
+    shorter excursion may be a passing lorry, hence the five seconds.
+
+    Attributes
+    ----------
+    max_position_m : float
+        Position error above which a scan is off [m].
+    max_yaw_rad : float
+        Heading error above which a scan is off [rad].
+    seconds : float
+        Time over which every scan must be off [s].
+    """
+
+    max_position_m: float = 20.0
+    max_yaw_rad: float = np.deg2rad(45.0)
+    seconds: float = 5.0
+
+
+@dataclass
+class FailureWatch:
+    """Watch a run with the truth at hand; on a failure, note the scan and give the true pose to restart from.
+
+    To be passed to `rol.mcl.localize` as its supervisor: the person who, in the paper, set the state by hand.
+
+    Attributes
+    ----------
+    stamps_us : array, shape (n,)
+        Times of the scans [us].
+    truth : array, shape (n, 3)
+        True poses T_map_radar [m, m, rad].
+    rule : FailureRule
+        What counts as a failure.
+    failures : list of int
+        Scans after which the run was restarted, filled while watching.
+    """
+
+    stamps_us: np.ndarray
+    truth: np.ndarray
+    rule: FailureRule = FailureRule()
+    failures: list[int] = field(default_factory=list)
+    off_since_us: int | None = None
+
+    def __call__(self, index: int, pose: np.ndarray) -> np.ndarray | None:
+        """Judge one estimate; give the true pose if the run has just failed, else None."""
+        ahead, left, turned = relative_pose(self.truth[index], pose)
+        if np.hypot(ahead, left) <= self.rule.max_position_m and abs(turned) <= self.rule.max_yaw_rad:
+            self.off_since_us = None
+            return None
+        stamp_us = int(self.stamps_us[index])
+        if self.off_since_us is None:
+            self.off_since_us = stamp_us
+        if stamp_us - self.off_since_us < self.rule.seconds * 1e6:
+            return None
+        self.failures.append(index)
+        self.off_since_us = None
+        return self.truth[index]
+
+
+def summarize(
+    estimate: np.ndarray,
+    truth: np.ndarray,
+    *,
+    method: str,
+    session: str,
+    failures: int,
+    update_ms_median: float,
+    seed: int,
+) -> dict[str, str | int | float]:
+    """Gather the figures of one run.
+
+    Parameters
+    ----------
+    estimate, truth : array, shape (n, 3)
+        Poses T_map_radar [m, m, rad].
+    method, session : str
+        Names.
+    failures : int
+        Restarts.
+    update_ms_median : float
+        Median time of a filter update [ms].
+    seed : int
+        Seed of the run.
+
+    Returns
+    -------
+    metrics : dict
+        The keys that `write_metrics` wants; shares between 0 and 1. Yin et al. 2020, Tables II and III.
+    """
+    errors = pose_errors(estimate, truth)
+    shares = {f"within_{m:.0f}m_{deg:.0f}deg": share_within(errors, m, deg) for m, deg in CLASSES}
+    return {
+        "method": method,
+        "session": session,
+        "n_scans": len(errors.position_m),
+        "failures": int(failures),
+        "rmse_m": rmse(errors.position_m),
+        "rmse_yaw_deg": rmse(np.rad2deg(errors.yaw_rad)),
+        **shares,
+        "update_ms_median": float(update_ms_median),
+        "seed": int(seed),
+    }
+
+
+def drift(estimate: np.ndarray, truth: np.ndarray, lengths_m: tuple[float, ...] = (100.0, 200.0)) -> float:
+    """Measure the drift of odometry over stretches of the way, as the KITTI benchmark does.
+
+    Parameters
+    ----------
+    estimate, truth : array, shape (n, 3)
+        Poses in any two frames [m, m, rad].
+    lengths_m : tuple of float
+        Lengths of the stretches along the true way [m]; one starts at every tenth pose.
+
+    Returns
+    -------
+    drift : float
+        Mean over stretches of the end's position error over the stretch's length; NaN if the way is too
+        short.
+    """
+    estimate, truth = check_poses(estimate, "estimate"), check_poses(truth, "truth")
+    way = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(truth[:, :2], axis=0).T))])
+    shares = []
+    for length in lengths_m:
+        first = np.arange(0, len(way), 10)
+        last = np.searchsorted(way, way[first] + length)
+        first, last = first[last < len(way)], last[last < len(way)]
+        ends = relative_pose(truth[first], truth[last]), relative_pose(estimate[first], estimate[last])
+        shares.append(np.hypot(*(ends[0] - ends[1])[:, :2].T) / length)
+    shares = np.concatenate(shares)
+    return float(np.mean(shares)) if len(shares) else float("nan")
+
+
+def write_text(path: Path | str, text: str) -> None:
+    """Write a text file that appears whole or not at all: to a temporary name beside it, then renamed.
+
+    Parameters
+    ----------
+    path : Path or str
+        File to write; its folder is made if need be.
+    text : str
+        Content.
+    """
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    temporary.write_text(text)
+    os.replace(temporary, path)
+
+
+def write_tum(path: Path | str, stamps_us: np.ndarray, poses: np.ndarray) -> None:
+    """Write a trajectory in the TUM format: time [s], x y z [m], quaternion x y z w, z and the tilt zero.
+
+    Parameters
+    ----------
+    path : Path or str
+        File to write; it appears whole or not at all.
+    stamps_us : array of int, shape (n,)
+        Increasing times [us].
+    poses : array, shape (n, 3)
+        Poses (x, y, yaw) [m, m, rad].
+
+    Raises
+    ------
+    EvaluationError
+        If lengths differ, times do not increase, or a value is not finite.
+    """
+    stamps_us, poses = np.asarray(stamps_us), np.asarray(poses, dtype=np.float64).reshape(-1, 3)
+    _check_trajectory(path, stamps_us, poses)
+    rows = (
+        f"{us // 10**6}.{us % 10**6:06d} {x:.6f} {y:.6f} 0 0 0 {np.sin(yaw / 2):.9f} {np.cos(yaw / 2):.9f}\n"
+        for us, (x, y, yaw) in zip(stamps_us.tolist(), poses.tolist(), strict=True)
+    )
+    write_text(path, "".join(rows))
+
+
+def read_tum(path: Path | str) -> tuple[np.ndarray, np.ndarray]:
+    """Read a planar trajectory in the TUM format.
+
+    Parameters
+    ----------
+    path : Path or str
+        File to read; lines that begin with # are skipped.
+
+    Returns
+    -------
+    stamps_us : array of int64, shape (n,)
+        Times [us].
+    poses : array, shape (n, 3)
+        Poses (x, y, yaw) [m, m, rad]; height and tilt are left out.
+
+    Raises
+    ------
+    EvaluationError
+        If a line has not eight numbers, a value is not finite, or times do not increase.
+    """
+    lines = [
+        line.split() for line in Path(path).read_text().splitlines() if line and not line.startswith("#")
+    ]
+    for number, line in enumerate(lines, start=1):
+        if len(line) != 8:
+            raise EvaluationError(f"{path}: pose {number} has {len(line)} values instead of 8")
+    try:
+        table = np.array(lines, dtype=np.float64).reshape(-1, 8)
+    except ValueError as error:
+        raise EvaluationError(f"{path}: {error}") from error
+    poses = np.stack([table[:, 1], table[:, 2], 2.0 * np.arctan2(table[:, 6], table[:, 7])], axis=1)
+    poses[:, 2] = (poses[:, 2] + np.pi) % (2.0 * np.pi) - np.pi
+    _check_trajectory(path, table[:, 0], poses)
+    return np.round(table[:, 0] * 1e6).astype(np.int64), poses
+
+
+METRICS = {
+    "method": str, "session": str, "n_scans": int, "failures": int, "rmse_m": float, "rmse_yaw_deg": float,
+    "within_1m_2deg": float, "within_2m_5deg": float, "within_5m_10deg": float, "update_ms_median": float,
+    "seed": int,
+}  # fmt: skip
+
+
+def write_metrics(path: Path | str, metrics: dict[str, str | int | float]) -> None:
+    """Write the figures of one run as json.
+
+    Parameters
+    ----------
+    path : Path or str
+        File to write; it appears whole or not at all.
+    metrics : dict
+        From `summarize`: exactly the keys of ``METRICS``.
+
+    Raises
+    ------
+    EvaluationError
+        If a key is missing, unknown, or of another type, or a number is not finite.
+    """
+    _check_metrics(path, metrics)
+    write_text(path, json.dumps(metrics, indent=2) + "\n")
+
+
+def read_metrics(path: Path | str) -> dict[str, str | int | float]:
+    """Read the figures of one run.
+
+    Parameters
+    ----------
+    path : Path or str
+        A ``metrics.json``.
+
+    Returns
+    -------
+    metrics : dict
+        The keys of ``METRICS``.
+
+    Raises
+    ------
+    EvaluationError
+        If the file is no json, or its keys or values are not those of a run.
+    """
+    try:
+        metrics = json.loads(Path(path).read_text())
+    except json.JSONDecodeError as error:
+        raise EvaluationError(f"{path}: not a whole json file ({error})") from error
+    _check_metrics(path, metrics)
+    return metrics
+
+
+def _check_metrics(path: Path | str, metrics: dict[str, str | int | float]) -> None:
+    """Check keys, types and finiteness."""
+    if not isinstance(metrics, dict) or set(metrics) != set(METRICS):
+        odd = sorted(set(metrics) ^ set(METRICS)) if isinstance(metrics, dict) else metrics
+        raise EvaluationError(f"{path}: keys missing or unknown: {odd}")
+    for key, kind in METRICS.items():
+        value = metrics[key]
+        if not isinstance(value, (kind, int) if kind is float else kind) or isinstance(value, bool):
+            raise EvaluationError(f"{path}: {key} is {value!r}, expected {kind.__name__}")
+        if kind is float and not np.isfinite(value):
+            raise EvaluationError(f"{path}: {key} is not finite")
+
+
+def _check_trajectory(path: Path | str, stamps: np.ndarray, poses: np.ndarray) -> None:
+    """Check that times increase, belong to poses, and that all is finite; positions count from one."""
+    if len(stamps) != len(poses):
+        raise EvaluationError(f"{path}: {len(stamps)} times for {len(poses)} poses")
+    if len(poses) == 0:
+        raise EvaluationError(f"{path}: no pose")
+    is_bad = ~(np.isfinite(poses).all(axis=1) & np.isfinite(stamps.astype(np.float64)))
+    if is_bad.any():
+        raise EvaluationError(f"{path}: pose {int(np.argmax(is_bad)) + 1} is not finite")
+    is_late = np.diff(stamps) <= 0
+    if is_late.any():
+        raise EvaluationError(f"{path}: times do not increase at pose {int(np.argmax(is_late)) + 2}")

@@ -1,0 +1,307 @@
+"""Point maps: accumulate the clouds of a session, register one map onto another.
+
+The paper's way to ground truth (Sec. IV-A): each session's start is set to zero, its lidar clouds are laid
+down along its own odometry, and each map is registered onto the first session's; the registration, multiplied
+onto the session's poses, gives them in the first map's frame.
+"""
+
+from __future__ import annotations
+
+import os
+import zipfile
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+try:
+    from .geometry import check_poses, compose, transform_points
+except ImportError:  # this file was copied on its own
+    from geometry import check_poses, compose, transform_points
+
+
+class MapError(ValueError):
+    """Raised for maps without points and for clouds that do not fit their poses."""
+
+
+def thin_points(points: np.ndarray, cell: float) -> tuple[np.ndarray, np.ndarray]:
+    """Keep one point per grid cell: the mean of the cell's points.
+
+    Parameters
+    ----------
+    points : array, shape (n, 2)
+        Points [m].
+    cell : float
+        Side of a cell [m].
+
+    Returns
+    -------
+    means : array, shape (m, 2)
+        One point per cell that holds any, ordered by cell [m].
+    cells : array of int, shape (m, 2)
+        Indices of these cells; cell (i, j) spans (i .. i + 1, j .. j + 1) * cell.
+    """
+    cells, inverse, counts = _unique_cells(points, cell)
+    sums = np.stack([np.bincount(inverse, points[:, k], len(counts)) for k in range(2)], axis=1)
+    return sums / counts[:, None], cells
+
+
+def accumulate_map(
+    clouds: Iterable[np.ndarray], poses: np.ndarray, cell: float = 0.25, min_hits: int = 2
+) -> np.ndarray:
+    """Lay clouds down at their poses and keep the cells that several of them hit.
+
+    Parameters
+    ----------
+    clouds : iterable of array, shape (n, 2)
+        One cloud per pose, each in its own frame [m]; empty clouds are fine.
+    poses : array, shape (k, 3)
+        Pose of each cloud in the map [m, m, rad].
+    cell : float
+        Side of a map cell [m].
+    min_hits : int
+        Clouds, not points, that must hit a cell; 2 drops what moved or was seen once.
+
+    Returns
+    -------
+    points : array, shape (m, 2)
+        One point per kept cell, the mean of what fell into it [m].
+
+    Raises
+    ------
+    MapError
+        If there are more or fewer clouds than poses, a point is not finite, or no cell is left. Yin et al.
+        2020, Sec. IV-A.
+    """
+    poses, thinned = check_poses(poses), []
+    for i, cloud in enumerate(clouds):
+        if i >= len(poses):
+            raise MapError(f"more clouds than the {len(poses)} poses")
+        if not np.isfinite(cloud).all():
+            raise MapError(f"cloud {i} holds a point that is not finite")
+        thinned.append(thin_points(transform_points(poses[i], np.reshape(cloud, (-1, 2))), cell)[0])
+    if len(thinned) != len(poses):
+        raise MapError(f"{len(thinned)} clouds for {len(poses)} poses")
+    points = np.concatenate(thinned) if thinned else np.zeros((0, 2))
+    cells, inverse, hits = _unique_cells(points, cell)
+    if not (hits >= min_hits).any():
+        raise MapError(f"the map is empty: no cell is hit by {min_hits} of {len(poses)} clouds")
+    sums = np.stack([np.bincount(inverse, points[:, k], len(hits)) for k in range(2)], axis=1)
+    return (sums / hits[:, None])[hits >= min_hits]
+
+
+@dataclass(frozen=True)
+class Registration:
+    """How one map lies on another.
+
+    Attributes
+    ----------
+    T_target_source : array, shape (3,)
+        Pose of the source map in the target map [m, m, rad].
+    share_1m : float
+        Share of the source's points within 1 m of a target point.
+    median_m : float
+        Median nearest distance from source to target [m].
+    converged : bool
+        Whether the finest stage came to rest.
+    stages : tuple of (float, float, float, array)
+        Per stage: reach about the start [m], largest distance of a pair [m], rmse of the pairs [m], the pose
+        after it.
+    """
+
+    T_target_source: np.ndarray
+    share_1m: float
+    median_m: float
+    converged: bool
+    stages: tuple[tuple[float, float, float, np.ndarray], ...]
+
+
+# reach about the source's start, largest and smallest limit of pair distances, cell of thinning [m]
+STAGES = ((100.0, 20.0, 5.0, 1.0), (200.0, 10.0, 3.0, 1.0), (np.inf, 6.0, 2.0, 0.5), (np.inf, 2.0, 0.5, 0.25))
+
+
+def register_maps(
+    source: np.ndarray,
+    target: np.ndarray,
+    init: np.ndarray | tuple[float, float, float] = (0.0, 0.0, 0.0),
+    *,
+    stages: tuple[tuple[float, float, float, float], ...] = STAGES,
+    max_iterations: int = 60,
+) -> Registration:
+    """Register one map onto another with ICP, from near to far and from coarse to fine.
+
+    Two sessions that begin at one place agree best there: the first stage takes only what lies about the
+    start, so that a wrong heading cannot carry the far end of the map away from its counterpart.
+
+    Parameters
+    ----------
+    source, target : array, shape (n, 2) and (m, 2)
+        Maps in their own frames [m].
+    init : array-like, shape (3,)
+        First guess of T_target_source [m, m, rad]; zero, as the sessions have the same starting place.
+    stages : tuple of (reach, max_distance, min_distance, cell)
+        Reach about the source's origin, the falling limit of pair distances, cell to which both are thinned
+        [m].
+    max_iterations : int
+        Iterations of each stage at most.
+
+    Returns
+    -------
+    registration : Registration
+        Yin et al. 2020, Sec. IV-A, "a precise ICP method".
+
+    Raises
+    ------
+    MapError
+        If a map is empty.
+    """
+    try:
+        from .odometry import icp_2d
+    except ImportError:  # this file was copied on its own: odometry.py is wanted beside it
+        from odometry import icp_2d
+    for points, name in ((source, "source"), (target, "target")):
+        if len(points) == 0:
+            raise MapError(f"the {name} map is empty")
+    pose, done, converged = check_poses(init, "initial guess"), [], False
+    for reach, max_distance, min_distance, cell in stages:
+        near = thin_points(source[np.hypot(source[:, 0], source[:, 1]) < reach], cell)[0]
+        result = icp_2d(
+            near,
+            thin_points(target, cell)[0],
+            pose,
+            max_distance=max_distance,
+            min_distance=min_distance,
+            max_iterations=max_iterations,
+            tolerance=1e-4,
+            max_points=len(near),
+        )
+        pose, converged = result.T_target_source, result.converged
+        done.append((reach, max_distance, result.rmse_m, pose))
+    distances = cKDTree(target).query(transform_points(pose, source))[0]
+    return Registration(
+        pose, float(np.mean(distances < 1.0)), float(np.median(distances)), converged, tuple(done)
+    )
+
+
+def to_first_map(T_map_session: np.ndarray, poses: np.ndarray) -> np.ndarray:
+    """Bring a session's own poses into the first map: multiply the registration onto them.
+
+    Parameters
+    ----------
+    T_map_session : array, shape (3,)
+        Registration of the session's map [m, m, rad].
+    poses : array, shape (n, 3)
+        Poses T_session_radar [m, m, rad].
+
+    Returns
+    -------
+    poses : array, shape (n, 3)
+        Poses T_map_radar. Yin et al. 2020, Sec. IV-A.
+    """
+    return compose(T_map_session, check_poses(poses))
+
+
+def residuals_along(clouds: Iterable[np.ndarray], poses: np.ndarray, map_points: np.ndarray) -> np.ndarray:
+    """Measure how well each cloud lies on a map at its pose.
+
+    Parameters
+    ----------
+    clouds : iterable of array, shape (n, 2)
+        One cloud per pose, each in its own frame [m].
+    poses : array, shape (k, 3)
+        Pose of each cloud in the map [m, m, rad].
+    map_points : array, shape (m, 2)
+        The map [m].
+
+    Returns
+    -------
+    medians : array, shape (k,)
+        Median nearest distance of each cloud's points to the map [m]; NaN for an empty cloud.
+    """
+    if len(map_points) == 0:
+        raise MapError("the map is empty")
+    tree, medians = cKDTree(map_points), []
+    for cloud, pose in zip(clouds, check_poses(poses), strict=True):
+        distances = tree.query(transform_points(pose, cloud))[0] if len(cloud) else [np.nan]
+        medians.append(float(np.median(distances)))
+    return np.array(medians)
+
+
+def save_map(path: Path | str, points: np.ndarray, T_map_session: np.ndarray) -> None:
+    """Write a session's map; the file appears whole or not at all.
+
+    Parameters
+    ----------
+    path : Path or str
+        An ``.npz`` to write.
+    points : array, shape (m, 2)
+        Points in the frame of the first map [m].
+    T_map_session : array, shape (3,)
+        Registration by which they came there [m, m, rad].
+
+    Raises
+    ------
+    MapError
+        If there is no point or a value is not finite.
+    """
+    path = Path(path)
+    _check_map(path, points, T_map_session)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.npz")
+    np.savez_compressed(temporary, points=points, T_map_session=np.asarray(T_map_session, dtype=np.float64))
+    os.replace(temporary, path)
+
+
+def load_map(path: Path | str) -> tuple[np.ndarray, np.ndarray]:
+    """Read a session's map.
+
+    Parameters
+    ----------
+    path : Path or str
+        An ``.npz`` from `save_map`.
+
+    Returns
+    -------
+    points : array, shape (m, 2)
+        Points in the frame of the first map [m].
+    T_map_session : array, shape (3,)
+        Registration of the session's own frame [m, m, rad].
+
+    Raises
+    ------
+    MapError
+        If the file is missing, truncated, or holds no map.
+    """
+    if not Path(path).is_file():
+        raise MapError(f"{path}: missing; chapter 06 writes it")
+    try:
+        with open(path, "rb") as file, np.load(file) as content:
+            points, T_map_session = content["points"], content["T_map_session"]
+    except (KeyError, ValueError, EOFError, OSError, zipfile.BadZipFile) as error:
+        raise MapError(f"{path}: not a whole map file ({error})") from error
+    _check_map(path, points, T_map_session)
+    return points, T_map_session
+
+
+def _check_map(path: Path | str, points: np.ndarray, T_map_session: np.ndarray) -> None:
+    """Refuse arrays that are no map."""
+    if np.ndim(points) != 2 or np.shape(points)[1] != 2 or np.shape(T_map_session) != (3,):
+        shapes = f"{np.shape(points)} and {np.shape(T_map_session)}"
+        raise MapError(f"{path}: expected points (m, 2) and a pose (3,), got {shapes}")
+    if len(points) == 0:
+        raise MapError(f"{path}: the map is empty")
+    if not (np.isfinite(points).all() and np.isfinite(T_map_session).all()):
+        raise MapError(f"{path}: a value is not finite")
+
+
+def _unique_cells(points: np.ndarray, cell: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Give the distinct cells of points, each point's cell, and how many points each cell holds."""
+    indices = np.floor(points / cell).astype(np.int64)
+    low = indices.min(axis=0) if len(indices) else np.zeros(2, dtype=np.int64)
+    width = int(np.ptp(indices[:, 1])) + 1 if len(indices) else 1
+    keys, inverse, counts = np.unique(
+        (indices[:, 0] - low[0]) * width + indices[:, 1] - low[1], return_inverse=True, return_counts=True
+    )
+    return np.stack([keys // width, keys % width], axis=1) + low, inverse, counts

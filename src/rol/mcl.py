@@ -1,0 +1,696 @@
+"""Monte Carlo localization on a prior lidar map: predict, weigh, resample, estimate.
+
+The filter of the paper (Sec. III-B, Eq. 6-9) in pieces that can be read, tested and copied one by one. A set
+of particles is an array (n, 3) of poses (x, y, yaw) in the map frame [m, m, rad] and an array (n,) of weights
+that sum to one. The map is asked through a grid: cell ``[i, j]`` spans ``origin + (i .. i + 1, j .. j + 1) *
+cell``, x along the first axis and y along the second; what lies outside the grid is unmatched.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numba import njit, prange
+
+try:
+    from .geometry import check_poses, compose, wrap_angle
+except ImportError:  # this file was copied on its own
+    from geometry import check_poses, compose, wrap_angle
+
+
+class MclError(ValueError):
+    """Raised for input from which no sound filter step can be made."""
+
+
+@dataclass(frozen=True)
+class MclSettings:
+    """Settings of the filter; the paper states none of these numbers, so each default gives its reason.
+
+    Attributes
+    ----------
+    n_particles : int
+        500: a scan's update stays near ten milliseconds on one core; more changes little once the pose is
+        tracked.
+    exponent : float
+        lambda of Eq. 8. 20: one per cent more matched points weighs a fifth more. With 1 the counts of
+        neighbouring particles differ too little to pull the estimate anywhere.
+    d_th_m : float
+        Matching distance of Eq. 9 [m]. 0.5: two image pixels, about the width of a wall in the map.
+    noise_forward_m, noise_side_m, noise_yaw_rad : float
+        Standard deviations added to every step, moving or not [m, m, rad]. Twice the noise of the authors'
+        published odometry (0.05 m, 0.02 m, 0.09 deg per step), for a fake cloud is noisier at some places
+        than on average.
+    noise_per_m, noise_yaw_per_rad : float
+        Standard deviation added per metre driven and per radian turned; 0.03 covers twice the 1.5 % by which
+        the authors' odometry is short.
+    start_spread_m, start_spread_yaw_rad : float
+        Standard deviation of the first particles about the given start [m, rad]: a start set by hand.
+    likelihood : str
+        "count" (Eq. 8-9) or "distance": each point adds the logarithm of a Gaussian of its distance plus a
+        floor.
+    sigma_m, floor, temperature : float
+        Of "distance" only: width of the Gaussian [m], share of points that may lie anywhere, and the factor
+        on the sum, below one because neighbouring points do not err independently.
+    resampling : str
+        "multinomial" (plain) or "systematic" (one draw for all).
+    resample_below : float
+        Resample when the effective sample size falls below this share of the particles; 1 means after each
+        scan.
+    cell_m : float
+        Side of a grid cell [m]; 0.125 keeps the rounding of a distance below 0.09 m, well inside ``d_th_m``.
+    """
+
+    n_particles: int = 500
+    exponent: float = 20.0
+    d_th_m: float = 0.5
+    noise_forward_m: float = 0.10
+    noise_side_m: float = 0.05
+    noise_yaw_rad: float = np.deg2rad(0.2)
+    noise_per_m: float = 0.03
+    noise_yaw_per_rad: float = 0.03
+    start_spread_m: float = 0.5
+    start_spread_yaw_rad: float = np.deg2rad(1.0)
+    likelihood: str = "count"
+    sigma_m: float = 0.4
+    floor: float = 0.2
+    temperature: float = 0.1
+    resampling: str = "multinomial"
+    resample_below: float = 1.0
+    cell_m: float = 0.125
+
+
+def settings_for(method: str, **changes: object) -> MclSettings:
+    """Give the settings of a named method.
+
+    Parameters
+    ----------
+    method : str
+        "paper": matched counts to the power lambda, plain resampling after each scan. "rol": distances
+        instead of a threshold, systematic resampling when the effective sample size falls below one half.
+    **changes
+        Settings that differ from the method's defaults.
+
+    Returns
+    -------
+    settings : MclSettings
+
+    Raises
+    ------
+    MclError
+        If the method is unknown.
+    """
+    methods = {
+        "paper": MclSettings(),
+        "rol": MclSettings(likelihood="distance", resampling="systematic", resample_below=0.5),
+    }
+    if method not in methods:
+        raise MclError(f"unknown method {method!r}; there are {', '.join(sorted(methods))}")
+    return replace(methods[method], **changes)
+
+
+@dataclass(frozen=True)
+class MapGrid:
+    """What a point is worth at each place of the map.
+
+    Attributes
+    ----------
+    values : array of uint8, shape (h, w)
+        0 or 1 (matched, Eq. 9), or a point's log-likelihood above the floor in steps of ``scale``; a byte per
+        cell, for the grid of a whole city should fit into the processor's reach. Outside the grid it is 0.
+    origin : array, shape (2,)
+        Corner of cell [0, 0] with the smallest x and y [m].
+    cell : float
+        Side of a cell [m].
+    scale : float
+        Log-likelihood of one step; 1 for matched cells.
+    best : int
+        Value of a cell on the map.
+    """
+
+    values: np.ndarray
+    origin: np.ndarray
+    cell: float
+    scale: float = 1.0
+    best: int = 1
+
+
+@njit(cache=True)
+def _stamp_distances(squares: np.ndarray, points: np.ndarray, reach: float) -> None:
+    """Lower, in place, each cell's squared distance [cells^2] to that of its nearest point [cells]."""
+    h, w = squares.shape
+    for k in range(points.shape[0]):
+        u, v = points[k, 0] - 0.5, points[k, 1] - 0.5
+        for i in range(max(0, int(np.ceil(u - reach))), min(h - 1, int(np.floor(u + reach))) + 1):
+            for j in range(max(0, int(np.ceil(v - reach))), min(w - 1, int(np.floor(v + reach))) + 1):
+                squares[i, j] = min(squares[i, j], (i - u) ** 2 + (j - v) ** 2)
+
+
+def distance_table(map_points: np.ndarray, cell: float, max_distance: float) -> tuple[np.ndarray, np.ndarray]:
+    """Tabulate the exact distance from each cell's centre to the nearest map point, up to a limit.
+
+    Parameters
+    ----------
+    map_points : array, shape (m, 2)
+        Points of the map [m].
+    cell : float
+        Side of a cell [m].
+    max_distance : float
+        Distances are cut off here, and the table reaches this far beyond the map [m].
+
+    Returns
+    -------
+    distances : array of float32, shape (h, w)
+        Distance of each cell's centre [m].
+    origin : array, shape (2,)
+        Corner of cell [0, 0] with the smallest x and y [m].
+
+    Raises
+    ------
+    MclError
+        If the map is empty or not finite.
+    """
+    map_points = _check_points(map_points, "map")
+    if len(map_points) == 0:
+        raise MclError("the map holds no point")
+    origin = np.floor((map_points.min(axis=0) - max_distance) / cell) * cell
+    shape = np.ceil((map_points.max(axis=0) + max_distance - origin) / cell).astype(int)
+    squares = np.full(tuple(shape), (max_distance / cell) ** 2, dtype=np.float32)
+    _stamp_distances(squares, (map_points - origin) / cell, max_distance / cell)
+    return np.sqrt(squares, out=squares) * np.float32(cell), origin
+
+
+def build_matched_grid(map_points: np.ndarray, d_th: float = 0.5, cell: float = 0.125) -> MapGrid:
+    """Mark the cells whose centre is closer than d_th to a map point.
+
+    Parameters
+    ----------
+    map_points : array, shape (m, 2)
+        Points of the map [m].
+    d_th : float
+        Matching distance [m].
+    cell : float
+        Side of a cell [m].
+
+    Returns
+    -------
+    grid : MapGrid
+        1 where matched, else 0. Yin et al. 2020, Sec. III-B, Eq. 9.
+    """
+    distances, origin = distance_table(map_points, cell, max_distance=d_th)
+    return MapGrid((distances < np.float32(d_th)).view(np.uint8), origin, cell)
+
+
+def build_likelihood_grid(
+    map_points: np.ndarray, sigma: float = 0.4, floor: float = 0.2, cell: float = 0.125
+) -> MapGrid:
+    """Tabulate a point's log-likelihood: a Gaussian of its distance to the map over a floor.
+
+    Parameters
+    ----------
+    map_points : array, shape (m, 2)
+        Points of the map [m].
+    sigma : float
+        Standard deviation of the Gaussian [m].
+    floor : float
+        Share of points that may lie anywhere, between 0 and 1.
+    cell : float
+        Side of a cell [m].
+
+    Returns
+    -------
+    grid : MapGrid
+        log(floor + (1 - floor) exp(-d^2 / 2 sigma^2)) - log(floor), rounded to 255 steps.
+    """
+    distances, origin = distance_table(map_points, cell, max_distance=4.0 * sigma)
+    excess = np.log1p((1.0 / floor - 1.0) * np.exp(-0.5 * (distances / sigma) ** 2))
+    scale = -np.log(floor) / 255.0
+    return MapGrid(np.round(excess / scale).astype(np.uint8), origin, cell, float(scale), 255)
+
+
+def build_grid(map_points: np.ndarray, settings: MclSettings) -> MapGrid:
+    """Build the grid that the settings' likelihood asks, once per map.
+
+    Parameters
+    ----------
+    map_points : array, shape (m, 2)
+        Points of the map [m].
+    settings : MclSettings
+        ``likelihood`` decides: matched cells, or the log-likelihood of a point in each cell.
+
+    Returns
+    -------
+    grid : MapGrid
+    """
+    if settings.likelihood == "count":
+        return build_matched_grid(map_points, settings.d_th_m, settings.cell_m)
+    if settings.likelihood != "distance":
+        raise MclError(f"unknown likelihood {settings.likelihood!r}; there are count, distance")
+    return build_likelihood_grid(map_points, settings.sigma_m, settings.floor, settings.cell_m)
+
+
+def _sum_values(particles, points, values, x0, y0, cell):
+    """Sum the grid's values under the points as seen from each particle."""
+    h, w = values.shape
+    sums = np.empty(particles.shape[0], dtype=np.int64)
+    for i in prange(particles.shape[0]):
+        c, s = np.cos(particles[i, 2]) / cell, np.sin(particles[i, 2]) / cell
+        u0, v0 = (particles[i, 0] - x0) / cell, (particles[i, 1] - y0) / cell
+        total = 0
+        for k in range(points.shape[0]):
+            u = u0 + c * points[k, 0] - s * points[k, 1]
+            v = v0 + s * points[k, 0] + c * points[k, 1]
+            if 0.0 <= u < h and 0.0 <= v < w:
+                total += values[int(u), int(v)]
+        sums[i] = total
+    return sums
+
+
+_sum_values_serial = njit(_sum_values, cache=True)
+_sum_values_parallel = njit(_sum_values, cache=True, parallel=True)
+
+
+def count_matches(
+    particles: np.ndarray,
+    points: np.ndarray,
+    matched: np.ndarray,
+    origin: np.ndarray,
+    cell: float,
+    *,
+    parallel: bool = False,
+) -> np.ndarray:
+    """Count for each particle the points of a cloud that fall on matched cells.
+
+    Parameters
+    ----------
+    particles : array, shape (n, 3)
+        Poses T_map_radar (x, y, yaw) [m, m, rad].
+    points : array, shape (m, 2)
+        Cloud in the radar frame [m].
+    matched : array of bool or uint8, shape (h, w)
+        1 for cells closer than d_th to the map, see `build_matched_grid`; other values are summed up, see
+        `build_likelihood_grid`.
+    origin : array-like, shape (2,)
+        Corner of cell [0, 0] with the smallest x and y [m].
+    cell : float
+        Side of a cell [m].
+    parallel : bool
+        Use all of numba's threads.
+
+    Returns
+    -------
+    counts : array of int, shape (n,)
+        N of Eq. 8; zeros for a cloud without points. Yin et al. 2020, Sec. III-B, Eq. 9.
+    """
+    particles, points = check_poses(particles, "particles"), _check_points(points, "cloud")
+    if matched.ndim != 2 or matched.dtype not in (np.dtype(bool), np.dtype(np.uint8)):
+        raise MclError(
+            f"matched: expected a 2D grid of bool or uint8, got {matched.ndim}D of {matched.dtype}"
+        )
+    kernel = _sum_values_parallel if parallel else _sum_values_serial
+    return kernel(particles, points, matched.view(np.uint8), float(origin[0]), float(origin[1]), float(cell))
+
+
+def sample_particles(
+    pose: np.ndarray, n: int, spread_m: float, spread_yaw: float, rng: np.random.Generator
+) -> np.ndarray:
+    """Draw particles about a pose.
+
+    Parameters
+    ----------
+    pose : array-like, shape (3,)
+        Mean (x, y, yaw) [m, m, rad].
+    n : int
+        Number of particles, at least one.
+    spread_m, spread_yaw : float
+        Standard deviations of x and y [m] and of the heading [rad].
+    rng : numpy.random.Generator
+        Source of randomness.
+
+    Returns
+    -------
+    particles : array, shape (n, 3)
+        Poses, yaw in [-pi, pi).
+    """
+    if n < 1:
+        raise MclError(f"at least one particle is needed, got {n}")
+    particles = check_poses(pose, "start pose") + rng.standard_normal((n, 3)) * (
+        spread_m,
+        spread_m,
+        spread_yaw,
+    )
+    particles[:, 2] = wrap_angle(particles[:, 2])
+    return particles
+
+
+def predict(
+    particles: np.ndarray, step: np.ndarray, settings: MclSettings, rng: np.random.Generator
+) -> np.ndarray:
+    """Move every particle by the odometry step, each with its own noise.
+
+    Parameters
+    ----------
+    particles : array, shape (n, 3)
+        Poses at the last scan [m, m, rad].
+    step : array-like, shape (3,)
+        Pose of this scan in the last one (x, y, yaw) [m, m, rad].
+    settings : MclSettings
+        The ``noise_...`` fields: a constant part plus a part that grows with the motion.
+    rng : numpy.random.Generator
+        Source of randomness.
+
+    Returns
+    -------
+    particles : array, shape (n, 3)
+        Poses at this scan. Yin et al. 2020, Sec. III-B, Eq. 7.
+    """
+    step = check_poses(step, "odometry step")
+    along = settings.noise_per_m * np.hypot(step[0], step[1])
+    sigmas = np.array(
+        [
+            settings.noise_forward_m + along,
+            settings.noise_side_m + along,
+            settings.noise_yaw_rad + settings.noise_yaw_per_rad * abs(step[2]),
+        ]
+    )
+    return compose(particles, step + rng.standard_normal((len(particles), 3)) * sigmas)
+
+
+def weigh(counts: np.ndarray, exponent: float) -> np.ndarray:
+    """Turn matched counts into the logarithms of the importance weights.
+
+    Parameters
+    ----------
+    counts : array, shape (n,)
+        Matched points of each particle, not negative.
+    exponent : float
+        lambda, above zero.
+
+    Returns
+    -------
+    log_weights : array, shape (n,)
+        lambda log N; minus infinity where nothing matched. Logarithms, for 1000^200 is beyond any float.
+        Yin et al. 2020, Sec. III-B, Eq. 8.
+    """
+    counts = np.asarray(counts, dtype=np.float64)
+    if not np.isfinite(counts).all() or (counts < 0).any():
+        raise MclError("counts must be finite and not negative")
+    if not exponent > 0:
+        raise MclError(f"the exponent must be above zero, got {exponent}")
+    return exponent * np.log(counts, out=np.full(counts.shape, -np.inf), where=counts > 0)
+
+
+def normalize_weights(log_weights: np.ndarray, prior: np.ndarray | None = None) -> tuple[np.ndarray, bool]:
+    """Multiply weights onto the prior ones and scale them to sum to one.
+
+    Parameters
+    ----------
+    log_weights : array, shape (n,)
+        Logarithms of the new weights; minus infinity is a weight of zero.
+    prior : array, shape (n,), optional
+        Weights before this scan; equal ones if not given.
+
+    Returns
+    -------
+    weights : array, shape (n,)
+        Normalized weights (eta of Eq. 6). When the total is zero the prior is returned unchanged: a scan that
+        fits nowhere tells nothing about where.
+    is_informed : bool
+        False when the total was zero.
+
+    Raises
+    ------
+    MclError
+        If a value is NaN or plus infinity.
+    """
+    log_weights = np.asarray(log_weights, dtype=np.float64)
+    prior = np.full(len(log_weights), 1.0 / len(log_weights)) if prior is None else _check_weights(prior)
+    if np.isnan(log_weights).any() or (log_weights == np.inf).any():
+        raise MclError("log-weights must not be NaN or infinite")
+    joint = log_weights + np.log(prior, out=np.full(prior.shape, -np.inf), where=prior > 0)
+    if np.isneginf(joint).all():
+        return prior, False
+    weights = np.exp(joint - joint.max())
+    return weights / weights.sum(), True
+
+
+def effective_sample_size(weights: np.ndarray) -> float:
+    """Give the number of equally weighted particles that would be worth as much.
+
+    Parameters
+    ----------
+    weights : array, shape (n,)
+        Weights, of any positive total.
+
+    Returns
+    -------
+    ess : float
+        Between 1 (one particle holds all) and n (all equal).
+    """
+    weights = _check_weights(weights)
+    return float(1.0 / np.sum(weights**2))
+
+
+def resample_multinomial(weights: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Draw n indices independently, each with its weight: plain resampling.
+
+    Parameters
+    ----------
+    weights : array, shape (n,)
+        Weights, of any positive total.
+    rng : numpy.random.Generator
+        Source of randomness.
+
+    Returns
+    -------
+    indices : array of int, shape (n,)
+        Particles to keep; index i occurs n * w_i times on average.
+    """
+    return _pick(_check_weights(weights), rng.random(len(weights)))
+
+
+def resample_systematic(weights: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Draw n indices with a comb of n equal teeth and one random offset: the least variance.
+
+    Parameters
+    ----------
+    weights : array, shape (n,)
+        Weights, of any positive total.
+    rng : numpy.random.Generator
+        Source of randomness.
+
+    Returns
+    -------
+    indices : array of int, shape (n,)
+        Particles to keep; index i occurs n * w_i times on average, and never a full copy more or less.
+    """
+    return _pick(_check_weights(weights), (np.arange(len(weights)) + rng.random()) / len(weights))
+
+
+def estimate_pose(particles: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, float, float]:
+    """Average the particles.
+
+    Parameters
+    ----------
+    particles : array, shape (n, 3)
+        Poses (x, y, yaw) [m, m, rad].
+    weights : array, shape (n,)
+        Their weights, of any positive total.
+
+    Returns
+    -------
+    pose : array, shape (3,)
+        Weighted mean; the heading is that of the mean direction, or the heaviest particle's where there is
+        none.
+    spread_m : float
+        Root of the weighted mean squared distance to the mean [m].
+    spread_yaw : float
+        Root of the weighted mean squared heading difference to the mean [rad].
+    """
+    weights = _check_weights(weights)
+    c, s = weights @ np.cos(particles[:, 2]), weights @ np.sin(particles[:, 2])
+    yaw = np.arctan2(s, c) if np.hypot(c, s) > 1e-9 else particles[np.argmax(weights), 2]
+    pose = np.array([weights @ particles[:, 0], weights @ particles[:, 1], wrap_angle(yaw)])
+    spread_m = np.sqrt(weights @ np.sum((particles[:, :2] - pose[:2]) ** 2, axis=1))
+    return pose, float(spread_m), float(np.sqrt(weights @ wrap_angle(particles[:, 2] - yaw) ** 2))
+
+
+@dataclass(frozen=True)
+class MclUpdate:
+    """One scan's estimate and what is worth watching.
+
+    Attributes
+    ----------
+    index : int
+        Number of the scan, from zero.
+    pose : array, shape (3,)
+        Estimate T_map_radar [m, m, rad].
+    particles, weights : array, shape (n, 3) and (n,)
+        The particles with their weights before resampling.
+    next_particles, next_weights : array, shape (n, 3) and (n,)
+        What the next scan starts from.
+    ess : float
+        Effective sample size before resampling.
+    spread_m, spread_yaw_rad : float
+        Spread of the particles about the estimate [m, rad].
+    match_share : float
+        Mean value of a point, on average over the particles, between 0 (all off the map) and 1 (all on it).
+    n_points : int
+        Points in the cloud.
+    is_informed : bool
+        False when the scan had no points or matched nowhere, and only the motion model moved the particles.
+    """
+
+    index: int
+    pose: np.ndarray
+    particles: np.ndarray
+    weights: np.ndarray
+    next_particles: np.ndarray
+    next_weights: np.ndarray
+    ess: float
+    spread_m: float
+    spread_yaw_rad: float
+    match_share: float
+    n_points: int
+    is_informed: bool
+
+
+def update(
+    index: int,
+    particles: np.ndarray,
+    weights: np.ndarray,
+    points: np.ndarray,
+    grid: MapGrid,
+    settings: MclSettings,
+    rng: np.random.Generator,
+) -> MclUpdate:
+    """Weigh moved particles by one scan, estimate the pose, and resample.
+
+    Parameters
+    ----------
+    index : int
+        Number of the scan.
+    particles, weights : array, shape (n, 3) and (n,)
+        Particles after `predict` and their weights.
+    points : array, shape (m, 2)
+        The scan's cloud in the radar frame [m]; without points the particles are left to the motion model.
+    grid : MapGrid
+        From `build_grid` with the same settings.
+    settings : MclSettings
+        Likelihood and resampling.
+    rng : numpy.random.Generator
+        Source of randomness.
+
+    Returns
+    -------
+    result : MclUpdate
+        Yin et al. 2020, Sec. III-B, Eq. 6-9.
+    """
+    is_informed, share = len(points) > 0, 0.0
+    if is_informed:
+        sums = count_matches(particles, points, grid.values, grid.origin, grid.cell)
+        is_count = settings.likelihood == "count"
+        log_weights = weigh(sums, settings.exponent) if is_count else settings.temperature * grid.scale * sums
+        weights, is_informed = normalize_weights(log_weights, weights)
+        share = float(weights @ sums) / (len(points) * grid.best)
+    pose, spread_m, spread_yaw = estimate_pose(particles, weights)
+    ess, kept, kept_weights = effective_sample_size(weights), particles, weights
+    if is_informed and ess <= settings.resample_below * len(weights):
+        draw = {"multinomial": resample_multinomial, "systematic": resample_systematic}[settings.resampling]
+        kept, kept_weights = particles[draw(weights, rng)], np.full(len(weights), 1.0 / len(weights))
+    return MclUpdate(
+        index,
+        pose,
+        particles,
+        weights,
+        kept,
+        kept_weights,
+        ess,
+        spread_m,
+        spread_yaw,
+        share,
+        len(points),
+        is_informed,
+    )
+
+
+def localize(
+    steps: Iterable[np.ndarray],
+    clouds: Iterable[np.ndarray],
+    grid: MapGrid,
+    start: np.ndarray,
+    settings: MclSettings,
+    rng: np.random.Generator,
+    supervisor: Callable[[int, np.ndarray], np.ndarray | None] | None = None,
+) -> Iterator[MclUpdate]:
+    """Run the filter scan by scan; a generator, so it can follow a live sensor.
+
+    Parameters
+    ----------
+    steps : iterable of array, shape (3,)
+        Odometry between successive scans, one fewer than clouds [m, m, rad].
+    clouds : iterable of array, shape (m, 2)
+        Cloud of each scan in the radar frame [m].
+    grid : MapGrid
+        From `build_grid` with the same settings.
+    start : array-like, shape (3,)
+        Pose T_map_radar at the first scan [m, m, rad].
+    settings : MclSettings
+        See there.
+    rng : numpy.random.Generator
+        Source of randomness.
+    supervisor : callable, optional
+        Called with the scan's number and the estimate; a pose that it returns restarts the particles there,
+        as the authors did by hand.
+
+    Yields
+    ------
+    result : MclUpdate
+        One per scan. Yin et al. 2020, Sec. III-B.
+    """
+    spreads = settings.start_spread_m, settings.start_spread_yaw_rad
+    particles = sample_particles(start, settings.n_particles, *spreads, rng)
+    weights = np.full(settings.n_particles, 1.0 / settings.n_particles)
+    steps = iter(steps)
+    for index, points in enumerate(clouds):
+        if index > 0:
+            step = next(steps, None)
+            if step is None:
+                raise MclError(f"no odometry step to scan {index}: one fewer than clouds are needed")
+            particles = predict(particles, step, settings, rng)
+        result = update(index, particles, weights, points, grid, settings, rng)
+        yield result
+        particles, weights = result.next_particles, result.next_weights
+        restart = supervisor(index, result.pose) if supervisor else None
+        if restart is not None:
+            particles = sample_particles(restart, settings.n_particles, *spreads, rng)
+            weights = np.full(settings.n_particles, 1.0 / settings.n_particles)
+
+
+def _pick(weights: np.ndarray, draws: np.ndarray) -> np.ndarray:
+    """Find draws in [0, 1] on the cumulative weights; one past their rounded end takes the last positive."""
+    indices = np.searchsorted(np.cumsum(weights), draws, side="right")
+    return np.minimum(indices, np.flatnonzero(weights)[-1])
+
+
+def _check_weights(weights: np.ndarray) -> np.ndarray:
+    """Check weights and scale them to sum to one."""
+    weights = np.asarray(weights, dtype=np.float64)
+    if weights.ndim != 1 or len(weights) == 0:
+        raise MclError(f"weights: expected shape (n,), got {weights.shape}")
+    if not np.isfinite(weights).all() or (weights < 0).any():
+        raise MclError("weights must be finite and not negative")
+    if weights.sum() <= 0:
+        raise MclError("all weights are zero")
+    return weights / weights.sum()
+
+
+def _check_points(points: np.ndarray, name: str) -> np.ndarray:
+    """Check a finite cloud (m, 2) and give it as contiguous float64."""
+    points = np.ascontiguousarray(points, dtype=np.float64)
+    if points.ndim != 2 or points.shape[1] != 2:
+        raise MclError(f"{name}: expected points of shape (m, 2), got {points.shape}")
+    if not np.isfinite(points).all():
+        raise MclError(f"{name}: a point is not finite")
+    return points

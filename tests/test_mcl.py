@@ -1,0 +1,378 @@
+"""The filter's pieces, each with numbers worked out by hand or against a slow oracle."""
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.ndimage import distance_transform_edt
+from scipy.spatial import cKDTree
+
+from rol import mcl
+from rol.geometry import transform_points
+
+# 5 x 5 cells of 1 m: a wall along x = 2.5 (row 2) and a post at (4.5, 0.5); first axis x, second axis y
+MATCHED = np.array(
+    [
+        [0, 0, 0, 0, 0],
+        [0, 0, 0, 0, 0],
+        [1, 1, 1, 1, 1],
+        [0, 0, 0, 0, 0],
+        [1, 0, 0, 0, 0],
+    ],
+    dtype=np.uint8,
+)
+CLOUD = np.array([[2.0, 0.0], [2.0, 1.0], [4.0, -2.0]])  # two wall points ahead, the post ahead to the right
+ORIGIN = np.zeros(2)
+
+
+class TopOfRange:
+    """A generator whose draws are the largest number below one: where cumulative sums round."""
+
+    def random(self, size=None):
+        return np.nextafter(1.0, 0.0) if size is None else np.full(size, np.nextafter(1.0, 0.0))
+
+
+@pytest.mark.parametrize("parallel", [False, True])
+@pytest.mark.parametrize(
+    ("particle", "count"),
+    [
+        ((0.5, 2.5, 0.0), 3),  # wall, wall, post
+        ((1.5, 2.5, 0.0), 0),  # 1 m too far: all in empty cells or outside
+        ((0.5, 1.5, 0.0), 2),  # 1 m to the right: the post's point leaves the grid
+        ((2.5, 0.5, np.pi / 2), 1),  # facing along y: the points fall on (2.5, 2.5), (1.5, 2.5), (4.5, 4.5)
+        ((4.5, 2.5, np.pi), 2),  # from the other side: the post's point falls on (0.5, 4.5)
+        ((100.0, 100.0, 0.0), 0),
+    ],
+)
+def test_count_matches_by_hand(particle, count, parallel):
+    got = mcl.count_matches(np.array([particle]), CLOUD, MATCHED, ORIGIN, 1.0, parallel=parallel)
+    assert got.tolist() == [count]
+    assert got.dtype == np.int64
+
+
+@pytest.mark.parametrize("move", [(10.0, -3.0, 0.0), (0.0, 0.0, 0.25)])
+def test_count_matches_moves_with_the_map(move):
+    # the same map elsewhere, or finer cells of the same map: the same counts
+    finer = np.kron(MATCHED, np.ones((4, 4), dtype=np.uint8)) if move[2] else MATCHED
+    cell, shift = (0.25 if move[2] else 1.0), np.array([*move[:2], 0.0])
+    particles = np.array([[0.5, 2.5, 0.0], [0.5, 1.5, 0.0], [4.5, 2.5, np.pi]]) + shift
+    got = mcl.count_matches(particles, CLOUD, finer.astype(bool), shift[:2], cell)
+    assert got.tolist() == [3, 2, 2]
+
+
+def test_count_matches_agrees_with_a_slow_loop():
+    rng = np.random.default_rng(1)
+    matched, origin, cell = rng.random((40, 60)) < 0.3, np.array([-3.0, 7.0]), 0.3
+    particles = rng.uniform((-5, 5, -4), (12, 28, 4), (50, 3))
+    points = rng.uniform(-6, 6, (30, 2))
+    expected = []
+    for particle in particles:
+        cells = np.floor((transform_points(particle, points) - origin) / cell).astype(int)
+        expected.append(sum(bool(0 <= i < 40 and 0 <= j < 60 and matched[i, j]) for i, j in cells))
+    assert mcl.count_matches(particles, points, matched, origin, cell).tolist() == expected
+
+
+def test_count_matches_refuses_other_grids_and_bad_points():
+    with pytest.raises(mcl.MclError, match="bool or uint8, got 2D of float64"):
+        mcl.count_matches(np.zeros((1, 3)), CLOUD, MATCHED.astype(float), ORIGIN, 1.0)
+    with pytest.raises(mcl.MclError, match="cloud: a point is not finite"):
+        mcl.count_matches(np.zeros((1, 3)), np.array([[np.nan, 0.0]]), MATCHED, ORIGIN, 1.0)
+    with pytest.raises(mcl.MclError, match=r"cloud: expected points of shape \(m, 2\)"):
+        mcl.count_matches(np.zeros((1, 3)), np.zeros((4, 3)), MATCHED, ORIGIN, 1.0)
+    with pytest.raises(ValueError, match="particles: value at index"):
+        mcl.count_matches(np.full((1, 3), np.nan), CLOUD, MATCHED, ORIGIN, 1.0)
+
+
+def test_distance_table_agrees_with_scipy():
+    rng = np.random.default_rng(2)
+    points = rng.uniform(-5, 9, (40, 2))
+    distances, origin = mcl.distance_table(points, cell=0.25, max_distance=2.0)
+    centres = origin + (np.stack(np.indices(distances.shape), axis=-1) + 0.5) * 0.25
+    expected = np.minimum(cKDTree(points).query(centres)[0], 2.0)
+    np.testing.assert_allclose(distances, expected, atol=1e-5)
+    # points on cell centres: the transform of the occupied cells is exact as well
+    points = (rng.integers(0, 30, (25, 2)) + 0.5) * 0.25
+    distances, origin = mcl.distance_table(points, cell=0.25, max_distance=2.0)
+    is_free = np.ones(distances.shape, dtype=bool)
+    is_free[tuple(np.floor((points - origin) / 0.25).astype(int).T)] = False
+    np.testing.assert_allclose(distances, np.minimum(0.25 * distance_transform_edt(is_free), 2.0), atol=1e-5)
+
+
+def test_matched_grid_uses_a_strict_threshold():
+    # one point in a cell's centre, threshold one cell: the four neighbours at d_th are not matched (Eq. 9)
+    grid = mcl.build_matched_grid(np.array([[0.5, 0.5]]), d_th=1.0, cell=1.0)
+    assert grid.values.sum() == 1
+    assert mcl.build_matched_grid(np.array([[0.5, 0.5]]), d_th=1.01, cell=1.0).values.sum() == 5
+
+
+def test_likelihood_grid_by_hand():
+    # on the point log(1 / floor), one sigma away log(floor + 0.8 exp(-1/2)) - log(floor), far away nothing
+    grid = mcl.build_likelihood_grid(np.array([[0.05, 0.05]]), sigma=0.5, floor=0.2, cell=0.1)
+    i, j = np.floor((np.array([0.05, 0.05]) - grid.origin) / 0.1).astype(int)
+    assert grid.values[i, j] == grid.best == 255
+    assert grid.values[i + 5, j] * grid.scale == pytest.approx(np.log((0.2 + 0.8 * 0.60653) / 0.2), abs=0.01)
+    assert grid.values[0, 0] == 0
+    assert 255 * grid.scale == pytest.approx(np.log(5.0))
+
+
+def test_an_empty_map_is_an_error():
+    for build in (mcl.build_matched_grid, mcl.build_likelihood_grid):
+        with pytest.raises(mcl.MclError, match="the map holds no point"):
+            build(np.zeros((0, 2)))
+    with pytest.raises(mcl.MclError, match="map: a point is not finite"):
+        mcl.build_matched_grid(np.array([[np.inf, 0.0]]))
+
+
+def test_settings_by_name():
+    assert mcl.settings_for("paper") == mcl.MclSettings()
+    assert mcl.settings_for("paper", n_particles=7).n_particles == 7
+    with pytest.raises(mcl.MclError, match="unknown method 'amcl'; there are paper, rol"):
+        mcl.settings_for("amcl")
+    with pytest.raises(mcl.MclError, match="unknown likelihood 'beam'"):
+        mcl.build_grid(CLOUD, mcl.MclSettings(likelihood="beam"))
+
+
+@pytest.mark.parametrize(
+    ("step", "expected"),
+    [
+        ((2.0, 0.0, 0.0), (1.0, 4.0, np.pi / 2)),  # straight on, facing along y
+        ((0.0, 0.0, np.pi / 2), (1.0, 2.0, -np.pi)),  # turn on the spot
+        ((2.0, 1.0, -np.pi / 2), (0.0, 4.0, 0.0)),  # turn and go
+    ],
+)
+def test_predict_without_noise(step, expected):
+    quiet = mcl.MclSettings(
+        noise_forward_m=0, noise_side_m=0, noise_yaw_rad=0, noise_per_m=0, noise_yaw_per_rad=0
+    )
+    moved = mcl.predict(np.array([[1.0, 2.0, np.pi / 2]]), step, quiet, np.random.default_rng(0))
+    np.testing.assert_allclose(moved, [expected], atol=1e-12)
+
+
+def test_predict_spreads_as_stated():
+    settings = mcl.MclSettings(
+        noise_forward_m=0.1, noise_side_m=0.05, noise_yaw_rad=0.01, noise_per_m=0.03, noise_yaw_per_rad=0.1
+    )
+    moved = mcl.predict(np.zeros((40_000, 3)), (2.0, 0.0, 0.2), settings, np.random.default_rng(4))
+    np.testing.assert_allclose(moved.mean(axis=0), (2.0, 0.0, 0.2), atol=3e-3)
+    np.testing.assert_allclose(moved.std(axis=0), (0.16, 0.11, 0.03), rtol=0.02)
+    with pytest.raises(ValueError, match="odometry step"):
+        mcl.predict(np.zeros((3, 3)), (np.nan, 0.0, 0.0), settings, np.random.default_rng(4))
+
+
+def test_sample_particles():
+    particles = mcl.sample_particles((1.0, 2.0, 3.1), 20_000, 0.5, 0.1, np.random.default_rng(5))
+    np.testing.assert_allclose(particles[:, :2].mean(axis=0), (1.0, 2.0), atol=0.02)
+    np.testing.assert_allclose(particles[:, :2].std(axis=0), 0.5, rtol=0.03)
+    assert particles[:, 2].min() >= -np.pi and particles[:, 2].max() < np.pi
+    with pytest.raises(mcl.MclError, match="at least one particle"):
+        mcl.sample_particles((0.0, 0.0, 0.0), 0, 0.5, 0.1, np.random.default_rng(5))
+
+
+def test_weights_by_hand():
+    # N = 1, 2, 3 and lambda = 2: weights 1, 4, 9 of 14
+    weights, is_informed = mcl.normalize_weights(mcl.weigh(np.array([1, 2, 3]), 2.0))
+    np.testing.assert_allclose(weights, [1 / 14, 4 / 14, 9 / 14])
+    assert is_informed
+    # a prior of 1/2, 1/4, 1/4 turns them into 2, 4, 9 of 15
+    weights, _ = mcl.normalize_weights(mcl.weigh(np.array([1, 2, 3]), 2.0), np.array([0.5, 0.25, 0.25]))
+    np.testing.assert_allclose(weights, [2 / 15, 4 / 15, 9 / 15])
+
+
+def test_weights_beyond_floats():
+    # 2000^400 overflows and (1/2)^400 of it underflows no sum
+    weights, _ = mcl.normalize_weights(mcl.weigh(np.array([2000, 1000, 0, 2000]), 400.0))
+    np.testing.assert_allclose(weights, [0.5, 0.0, 0.0, 0.5], atol=1e-100)
+
+
+def test_zero_total_weight_leaves_the_weights_as_they_were():
+    prior = np.array([0.2, 0.8])
+    weights, is_informed = mcl.normalize_weights(mcl.weigh(np.array([0, 0]), 2.0), prior)
+    np.testing.assert_array_equal(weights, prior)
+    assert not is_informed
+    weights, _ = mcl.normalize_weights(np.full(4, -np.inf))
+    np.testing.assert_array_equal(weights, 0.25)
+    # likewise when only particles of no prior weight match
+    weights, is_informed = mcl.normalize_weights(np.array([0.0, -np.inf]), np.array([0.0, 1.0]))
+    assert weights.tolist() == [0.0, 1.0] and not is_informed
+
+
+def test_bad_weights_are_refused():
+    with pytest.raises(mcl.MclError, match="counts must be"):
+        mcl.weigh(np.array([1.0, np.nan]), 2.0)
+    with pytest.raises(mcl.MclError, match="counts must be"):
+        mcl.weigh(np.array([-1]), 2.0)
+    with pytest.raises(mcl.MclError, match="exponent must be above zero"):
+        mcl.weigh(np.array([1]), 0.0)
+    with pytest.raises(mcl.MclError, match="log-weights must not be NaN"):
+        mcl.normalize_weights(np.array([0.0, np.nan]))
+    for resample in (mcl.resample_multinomial, mcl.resample_systematic):
+        for weights, fault in (
+            ([np.nan, 1.0], "finite"),
+            ([-0.5, 1.5], "negative"),
+            ([0.0, 0.0], "all weights are zero"),
+        ):
+            with pytest.raises(mcl.MclError, match=fault):
+                resample(np.array(weights), np.random.default_rng(0))
+    with pytest.raises(mcl.MclError, match="expected shape"):
+        mcl.effective_sample_size(np.zeros(0))
+
+
+@pytest.mark.parametrize(
+    ("weights", "ess"),
+    [([0.25] * 4, 4.0), ([1.0, 0.0, 0.0], 1.0), ([5.0, 5.0], 2.0), ([0.5, 0.25, 0.25], 1 / 0.375)],
+)
+def test_effective_sample_size(weights, ess):
+    assert mcl.effective_sample_size(np.array(weights)) == pytest.approx(ess)
+
+
+@pytest.mark.parametrize("resample", [mcl.resample_multinomial, mcl.resample_systematic])
+def test_resampling_copies_each_particle_as_often_as_it_weighs(resample):
+    rng, weights, runs = np.random.default_rng(6), np.array([0.45, 0.35, 0.0, 0.15, 0.05]), 20_000
+    copies = np.array([np.bincount(resample(weights, rng), minlength=5) for _ in range(runs)])
+    assert (copies.sum(axis=1) == 5).all() and (copies[:, 2] == 0).all()
+    np.testing.assert_allclose(copies.mean(axis=0), 5 * weights, atol=0.03)  # sd of the mean below 0.01
+    if resample is mcl.resample_systematic:
+        assert np.abs(copies - 5 * weights).max() < 1.0  # never a whole copy more or less
+
+
+@pytest.mark.parametrize("resample", [mcl.resample_multinomial, mcl.resample_systematic])
+def test_resampling_when_the_cumulative_sum_rounds_below_the_draw(resample):
+    weights = np.append(np.full(7, 1 / 7), 0.0)  # the running sum is 0.9999999999999998
+    assert np.cumsum(weights / weights.sum())[-1] < np.nextafter(1.0, 0.0)
+    indices = resample(weights, TopOfRange())
+    assert indices.max() == 6  # the last particle with weight, not the one without, not one past the end
+
+
+def test_estimate_pose():
+    particles = np.array([[0.0, 0.0, np.pi - 0.1], [2.0, 0.0, -np.pi + 0.1]])
+    pose, spread_m, spread_yaw = mcl.estimate_pose(particles, np.array([0.5, 0.5]))
+    np.testing.assert_allclose(pose, [1.0, 0.0, -np.pi], atol=1e-12)  # the mean heading is west, not east
+    assert spread_m == pytest.approx(1.0) and spread_yaw == pytest.approx(0.1)
+    pose, _, _ = mcl.estimate_pose(particles, np.array([3.0, 1.0]))
+    np.testing.assert_allclose(pose[:2], [0.5, 0.0])
+    opposite = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, -np.pi]])
+    assert (
+        mcl.estimate_pose(opposite, np.array([0.5, 0.5]))[0][2] == 0.0
+    )  # no mean direction: the first heaviest
+
+
+def wall_filter(clouds, steps, **changes):
+    """Run the filter along a straight wall with a corner, from the origin."""
+    points = np.stack([np.arange(0.0, 40.0, 0.25), np.full(160, 5.0)], axis=1)
+    points = np.concatenate([points, np.stack([np.full(20, 40.0), np.arange(0.0, 5.0, 0.25)], axis=1)])
+    settings = mcl.MclSettings(n_particles=200, **changes)
+    grid = mcl.build_grid(points, settings)
+    rng = np.random.default_rng(8)
+    return points, list(mcl.localize(steps, clouds, grid, (30.0, 0.0, 0.0), settings, rng))
+
+
+def test_scan_without_points_leaves_the_particles_to_the_motion_model():
+    _, updates = wall_filter([np.zeros((0, 2))] * 4, [(1.0, 0.0, 0.0)] * 3)
+    np.testing.assert_allclose(updates[-1].pose, (33.0, 0.0, 0.0), atol=0.15)
+    spreads = [u.spread_m for u in updates]
+    assert spreads == sorted(spreads)
+    for u in updates:
+        assert not u.is_informed and u.match_share == 0.0 and u.ess == pytest.approx(200)
+        np.testing.assert_array_equal(u.next_particles, u.particles)
+
+
+def test_scan_that_fits_nowhere_leaves_the_particles_to_the_motion_model():
+    _, updates = wall_filter([np.array([[0.0, -500.0]])] * 2, [(1.0, 0.0, 0.0)])
+    assert [u.is_informed for u in updates] == [False, False]
+    np.testing.assert_array_equal(updates[1].next_particles, updates[1].particles)
+
+
+@pytest.mark.parametrize(
+    "changes", [{}, {"likelihood": "distance", "resampling": "systematic", "resample_below": 0.5}]
+)
+def test_update_pulls_the_particles_to_the_corner(changes):
+    truth = np.array([30.5, 0.4, 0.01])
+    points, _ = wall_filter([], [], **changes)
+    cloud = transform_points((-truth[0], -truth[1], 0.0), points)
+    cloud = transform_points((0.0, 0.0, -truth[2]), cloud)
+    _, updates = wall_filter([cloud] * 6, [(0.0, 0.0, 0.0)] * 5, **changes)
+    assert np.hypot(*(updates[-1].pose - truth)[:2]) < 0.2
+    assert updates[-1].spread_m < updates[0].spread_m or updates[-1].spread_m < 0.3
+    assert updates[-1].match_share > 0.8
+    assert all(u.next_weights.sum() == pytest.approx(1.0) for u in updates)
+
+
+def test_weights_are_equal_after_resampling_and_kept_without():
+    points, _ = wall_filter([], [])
+    _, (plain,) = wall_filter([points - (30.0, 0.0)], [])
+    np.testing.assert_allclose(plain.next_weights, 1 / 200)
+    assert plain.ess < 200
+    _, (lazy,) = wall_filter([points - (30.0, 0.0)], [], resample_below=0.01)
+    np.testing.assert_array_equal(lazy.next_weights, lazy.weights)
+    np.testing.assert_array_equal(lazy.next_particles, lazy.particles)
+
+
+def test_supervisor_restarts_the_particles():
+    calls = []
+
+    def supervisor(index, pose):
+        calls.append(index)
+        return (10.0, 0.0, 0.0) if index == 1 else None
+
+    points, _ = wall_filter([], [])
+    settings = mcl.MclSettings(n_particles=50)
+    updates = mcl.localize(
+        [(0.0, 0.0, 0.0)] * 2, [np.zeros((0, 2))] * 3, mcl.build_grid(points, settings), (30.0, 0.0, 0.0),
+        settings, np.random.default_rng(9), supervisor,
+    )  # fmt: skip
+    poses = np.array([u.pose for u in updates])
+    assert calls == [0, 1, 2]
+    np.testing.assert_allclose(poses[:, 0], (30.0, 30.0, 10.0), atol=0.4)
+
+
+def test_localize_is_online():
+    # each estimate is there before the next cloud or step is asked for
+    given = []
+
+    def clouds():
+        for k in range(3):
+            given.append(k)
+            yield np.zeros((0, 2))
+
+    settings = mcl.MclSettings(n_particles=10)
+    grid = mcl.build_grid(CLOUD, settings)
+    updates = mcl.localize(
+        iter([(1.0, 0.0, 0.0)] * 2), clouds(), grid, (0.0, 0.0, 0.0), settings, np.random.default_rng(0)
+    )
+    assert next(updates).index == 0 and given == [0]
+    assert next(updates).index == 1 and given == [0, 1]
+
+
+def test_more_clouds_than_steps_is_an_error():
+    with pytest.raises(mcl.MclError, match="no odometry step to scan 2"):
+        wall_filter([np.zeros((0, 2))] * 3, [(0.0, 0.0, 0.0)])
+
+
+def test_the_file_works_copied_alone(tmp_path):
+    source = Path(mcl.__file__).parent
+    for name in ("mcl.py", "geometry.py"):
+        shutil.copy(source / name, tmp_path)
+    code = (
+        "import numpy as np, mcl;"
+        "g = mcl.build_matched_grid(np.array([[5.0, 0.0], [5.0, 1.0]]));"
+        "c = np.array([[5.0, 0.1], [3.0, 0.0]]);"
+        "print(mcl.count_matches(np.zeros((1, 3)), c, g.values, g.origin, g.cell)[0])"
+    )
+    done = subprocess.run(
+        [sys.executable, "-W", "error", "-c", code], cwd=tmp_path, capture_output=True, text=True,
+        env={k: v for k, v in os.environ.items() if k != "PYTHONPATH"},
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.strip() == "1" and done.stderr == ""
+
+
+def test_defaults_are_the_documented_ones():
+    # a changed default must be argued in the docstring again
+    settings = mcl.MclSettings()
+    text = mcl.MclSettings.__doc__
+    assert f"{settings.n_particles}:" in text and f"lambda of Eq. 8. {settings.exponent:.0f}:" in text
+    assert f"[m]. {settings.d_th_m:.1f}:" in text
