@@ -1,0 +1,285 @@
+# Which notebook runs on which session with which parameters, then the book.
+#
+#   snakemake -c2                                     the demo profile
+#   snakemake -c2 --configfile config/smoke.yaml      another profile
+#   snakemake -c2 -n                                  only say what would run, and why
+#
+# A run is out of date when the code it uses, its parameters or its inputs changed. Code means the notebook's code cells
+# and the modules of src/rol that it imports, without comments and docstrings: they enter as a digest in `params`, so
+# editing a text reruns no notebook (the book takes the new text all the same).
+
+import json
+import os
+import sys
+from pathlib import Path
+
+sys.path.insert(0, str(Path(workflow.basedir, "workflow")))
+import chapters
+from chapters import NOTEBOOKS, Run
+from snakemake_interface_common.exceptions import WorkflowError
+
+if not workflow.configfiles:
+    configfile: "config/demo.yaml"
+
+CONFIG_FILE = os.path.relpath(workflow.configfiles[-1])
+chapters.check_config(config, CONFIG_FILE)
+SESSIONS_ROOT, OUT, BOOK = config["sessions_root"], config["out_dir"], config["book_dir"]
+SESSIONS, METHODS = config["sessions"], config["methods"]
+TRAIN, LOCALIZE = SESSIONS[0], SESSIONS[1:]
+RUNS = chapters.all_runs(config)
+PARAMETERS = {run: chapters.run_parameters(config, run) for run in RUNS}  # a name that a notebook lacks ends here
+DIGESTS = {chapter: chapters.chapter_digest(NOTEBOOKS / f"{chapter}.ipynb") for chapter in chapters.CHAPTERS}
+RECIPES = (config["virtual"] or {}).get("sessions", {})
+PYTHON, JUPYTER_BOOK = sys.executable, Path(sys.executable).with_name("jupyter-book")
+
+# One job uses the threads it was given and no more. Figures go into the notebook, whatever the caller's environment says.
+ENVIRONMENT = "NUMBA_NUM_THREADS={threads} PYTHONHASHSEED=0 MPLBACKEND=module://matplotlib_inline.backend_inline "
+# papermill writes to the log, since Snakemake deletes the outputs of a failed job, and a traceback with it.
+PAPERMILL = ENVIRONMENT + (
+    "{PYTHON} -m papermill {input.notebook} {log.notebook} --kernel python3 --no-progress-bar {params.arguments} "
+    "> {log.text} 2>&1 && cp {log.notebook} {output.notebook} "
+    "|| {{ tail -n 30 {log.text}; echo 'the failed notebook, with its traceback: {log.notebook}'; exit 1; }}"
+)
+
+
+wildcard_constraints:
+    session="|".join(SESSIONS),
+    method="|".join(METHODS),
+
+
+def session_made(session):
+    """Name the file that says a session is there; a virtual one is made by its rule, a real one must be on disk."""
+    if session in RECIPES:
+        return f"{SESSIONS_ROOT}/{session}/session.json"
+    stamps = f"{SESSIONS_ROOT}/{session}/radar.timestamps"
+    if not Path(stamps).is_file():
+        raise WorkflowError(f"{stamps} is missing, and {CONFIG_FILE} does not say how to make {session}; see data/README.md")
+    return stamps
+
+
+def recipe(session):
+    """Give what a virtual session depends on: the settings common to all and its own."""
+    return {**config["virtual"], "sessions": {session: RECIPES[session]}}
+
+
+def executed(chapter, folder=f"{OUT}/notebooks"):
+    """Name the executed notebook of a chapter, with wildcards where it runs more than once."""
+    often = chapters.CHAPTERS[chapter]
+    run = Run(chapter, "" if often == "once" else "{session}", "{method}" if often == "method" else "")
+    return str(run.path(OUT)).replace(f"{OUT}/notebooks", folder, 1)
+
+
+def logs(chapter):
+    """Name the logs of a chapter: the notebook as far as it came, and what papermill said."""
+    notebook = executed(chapter, f"{OUT}/logs")
+    return {"notebook": notebook, "text": notebook.replace(".ipynb", ".log")}
+
+
+def arguments(chapter):
+    """Give the function from wildcards to papermill's arguments."""
+    return lambda wildcards: chapters.papermill_arguments(
+        PARAMETERS[Run(chapter, wildcards.get("session", ""), wildcards.get("method", ""))]
+    )
+
+
+def source(chapter):
+    """Name a chapter's notebook; its date does not count, the digest of its code does."""
+    return ancient(f"notebooks/{chapter}.ipynb")
+
+
+rule book:
+    input:
+        notebooks=[run.path(OUT) for run in RUNS],
+        sources=[f"notebooks/{chapter}.ipynb" for chapter in chapters.CHAPTERS],
+        pages=[str(path) for path in sorted(Path("book").rglob("*")) if path.is_file()],
+        modules=[str(path) for path in sorted(Path("src/rol").rglob("*.py"))],
+        stage="workflow/stage_book.py",
+    output:
+        f"{BOOK}/_build/html/index.html",
+    log:
+        f"{OUT}/logs/book.log",
+    params:
+        config=json.dumps(config, sort_keys=True),
+    message:
+        "the book in {BOOK}"
+    shell:
+        "{PYTHON} workflow/stage_book.py {CONFIG_FILE} > {log} 2>&1 "
+        "&& {JUPYTER_BOOK} build {BOOK} --all -W -n --keep-going >> {log} 2>&1 "
+        "|| {{ grep -E 'WARNING|ERROR|Error' {log} || tail -n 30 {log}; echo 'the whole log: {log}'; exit 1; }}"
+
+
+rule chapters:
+    input:
+        [run.path(OUT) for run in RUNS],
+
+
+rule virtual_session:
+    output:
+        SESSIONS_ROOT + "/{session}/session.json",
+    log:
+        SESSIONS_ROOT + "/{session}.log",
+    params:
+        recipe=lambda wildcards: json.dumps(recipe(wildcards.session), sort_keys=True),
+        code=chapters.virtual_digest(),
+    message:
+        "virtual session {wildcards.session}"
+    shell:  # the writer goes on with what is there, which is right after a stop and wrong after a change of its code
+        'made={SESSIONS_ROOT}/{wildcards.session}; [ "$(cat $made.code 2>/dev/null)" = {params.code} ] || rm -rf "$made"; '
+        "echo {params.code} > $made.code; "
+        + ENVIRONMENT + "{PYTHON} -m rol.virtual {CONFIG_FILE} --session {wildcards.session} --out {SESSIONS_ROOT} "
+        "> {log} 2>&1 || {{ tail -n 30 {log}; exit 1; }}"
+
+
+rule sessions:
+    input:
+        notebook=source("01_sessions"),
+        sessions=[session_made(session) for session in SESSIONS],
+    output:
+        notebook=executed("01_sessions"),
+    log:
+        **logs("01_sessions"),
+    params:
+        arguments=arguments("01_sessions"),
+        code=DIGESTS["01_sessions"],
+    message:
+        "01 sessions"
+    shell:
+        PAPERMILL
+
+
+rule alignment:
+    input:
+        notebook=source("02_alignment"),
+        session=lambda wildcards: session_made(wildcards.session),
+    output:
+        notebook=executed("02_alignment"),
+        alignment=OUT + "/alignment/{session}/alignment.csv",
+    log:
+        **logs("02_alignment"),
+    params:
+        arguments=arguments("02_alignment"),
+        code=DIGESTS["02_alignment"],
+    message:
+        "02 alignment, {wildcards.session}"
+    shell:
+        PAPERMILL
+
+
+rule ground_removal:
+    input:
+        notebook=source("03_ground_removal"),
+        session=lambda wildcards: session_made(wildcards.session),
+        alignment=OUT + "/alignment/{session}/alignment.csv",
+    output:
+        notebook=executed("03_ground_removal"),
+        pairs=OUT + "/pairs/{session}/pairs.json",
+    log:
+        **logs("03_ground_removal"),
+    params:
+        arguments=arguments("03_ground_removal"),
+        code=DIGESTS["03_ground_removal"],
+    message:
+        "03 ground removal, {wildcards.session}"
+    shell:
+        PAPERMILL
+
+
+rule pix2pix:
+    input:
+        notebook=source("04_pix2pix"),
+        pairs=f"{OUT}/pairs/{TRAIN}/pairs.json",
+    output:
+        notebook=executed("04_pix2pix"),
+        weights=f"{OUT}/pix2pix/generator.safetensors",
+    log:
+        **logs("04_pix2pix"),
+    params:
+        arguments=arguments("04_pix2pix"),
+        code=DIGESTS["04_pix2pix"],
+    threads: 2
+    message:
+        "04 pix2pix: training"
+    shell:
+        PAPERMILL
+
+
+rule real_vs_fake:
+    input:
+        notebook=source("05_real_vs_fake"),
+        pairs=expand(OUT + "/pairs/{session}/pairs.json", session=SESSIONS),
+        weights=f"{OUT}/pix2pix/generator.safetensors",
+    output:
+        notebook=executed("05_real_vs_fake"),
+        fake=expand(OUT + "/fake/{session}/fake.json", session=SESSIONS),
+        similarity=expand(OUT + "/similarity/{session}.json", session=SESSIONS),
+    log:
+        **logs("05_real_vs_fake"),
+    params:
+        arguments=arguments("05_real_vs_fake"),
+        code=DIGESTS["05_real_vs_fake"],
+    threads: 2
+    message:
+        "05 real against fake"
+    shell:
+        PAPERMILL
+
+
+rule ground_truth:
+    input:
+        notebook=source("06_ground_truth"),
+        sessions=[session_made(session) for session in SESSIONS],
+        alignment=expand(OUT + "/alignment/{session}/alignment.csv", session=SESSIONS),
+    output:
+        notebook=executed("06_ground_truth"),
+        summary=f"{OUT}/maps/summary.json",
+        maps=expand(OUT + "/maps/{session}.npz", session=SESSIONS),
+        truth=expand(OUT + "/ground_truth/{session}.tum", session=SESSIONS),
+    log:
+        **logs("06_ground_truth"),
+    params:
+        arguments=arguments("06_ground_truth"),
+        code=DIGESTS["06_ground_truth"],
+    message:
+        "06 ground truth"
+    shell:
+        PAPERMILL
+
+
+rule localization:
+    input:
+        notebook=source("07_localization"),
+        fake=OUT + "/fake/{session}/fake.json",
+        summary=f"{OUT}/maps/summary.json",
+        map=f"{OUT}/maps/{TRAIN}.npz",
+        truth=OUT + "/ground_truth/{session}.tum",
+    output:
+        notebook=executed("07_localization"),
+        metrics=OUT + "/localization/{session}/{method}/metrics.json",
+    log:
+        **logs("07_localization"),
+    params:
+        arguments=arguments("07_localization"),
+        code=DIGESTS["07_localization"],
+    message:
+        "07 localization, {wildcards.session}, {wildcards.method}"
+    shell:
+        PAPERMILL
+
+
+rule results:
+    input:
+        notebook=source("08_results"),
+        metrics=expand(OUT + "/localization/{session}/{method}/metrics.json", session=LOCALIZE, method=METHODS),
+        summary=f"{OUT}/maps/summary.json",
+        tables=[str(path) for path in sorted(Path("data/paper").glob("*.csv"))],
+    output:
+        notebook=executed("08_results"),
+    log:
+        **logs("08_results"),
+    params:
+        arguments=arguments("08_results"),
+        code=DIGESTS["08_results"],
+    message:
+        "08 results"
+    shell:
+        PAPERMILL

@@ -1,0 +1,128 @@
+"""The built book as a reader gets it: pages, links, pictures, numbers; and nothing that needs a network."""
+
+import re
+from functools import cache
+from pathlib import Path
+from urllib.parse import unquote, urlsplit
+
+import pytest
+from bs4 import BeautifulSoup
+
+from chapters import book_pages
+
+OF_THE_BUILDER = {"genindex.html", "search.html"}
+
+
+@cache
+def read_page(path: Path) -> BeautifulSoup:
+    return BeautifulSoup(path.read_text(), "html.parser")
+
+
+@pytest.fixture
+def html(profile: dict) -> Path:
+    return Path(profile["book_dir"], "_build", "html").resolve()
+
+
+def pages_of(html: Path) -> list[Path]:
+    return [page for page in sorted(html.rglob("*.html")) if "_static" not in page.relative_to(html).parts]
+
+
+def is_inside(address: str) -> bool:
+    return not urlsplit(address).scheme and not urlsplit(address).netloc
+
+
+def test_every_chapter_has_its_page_with_a_title_of_its_own(profile: dict, html: Path) -> None:
+    titles = [read_page(html / "notebooks" / f"{page}.html").h1.get_text() for page in book_pages(profile)]
+    assert len(set(titles)) == len(titles)
+
+
+def test_every_page_can_be_reached_from_the_first(html: Path) -> None:
+    side = read_page(html / "intro.html").find(class_="bd-links")
+    listed = {
+        (html / link["href"]).resolve() for link in side.find_all("a", href=True) if link["href"] != "#"
+    }
+    missing = {
+        page for page in pages_of(html) if page.name not in OF_THE_BUILDER | {"index.html", "intro.html"}
+    } - listed
+    assert not missing
+
+
+def test_every_internal_link_and_anchor_resolves(html: Path) -> None:
+    broken = []
+    for page in pages_of(html):
+        for link in read_page(page).find_all("a", href=True):
+            parts = urlsplit(link["href"])
+            if not is_inside(link["href"]):
+                continue
+            target = (page.parent / unquote(parts.path)).resolve() if parts.path else page
+            if (
+                not target.is_file()
+                or parts.fragment
+                and target.suffix == ".html"
+                and not has_anchor(target, unquote(parts.fragment))
+            ):
+                broken.append((page.name, link["href"]))
+    assert not broken
+
+
+def has_anchor(page: Path, name: str) -> bool:
+    return (
+        read_page(page).find(attrs={"id": name}) is not None
+        or read_page(page).find("a", attrs={"name": name}) is not None
+    )
+
+
+def test_every_image_exists_and_has_alt_text(html: Path) -> None:
+    faults = []
+    for page in pages_of(html):
+        for image in read_page(page).find_all("img"):
+            source = image.get("src", "")
+            if not source.startswith("data:") and not (page.parent / unquote(source)).is_file():
+                faults.append((page.name, source))
+            if not image.get("alt", "").strip() or image["alt"].startswith(("..", "_images/")):
+                faults.append((page.name, source, "no alt text"))
+    assert not faults
+
+
+def test_every_caption_says_virtual_or_real(profile: dict, html: Path) -> None:
+    for page in book_pages(profile):
+        for caption in read_page(html / "notebooks" / f"{page}.html").select("figcaption .caption-text"):
+            assert re.search("virtual|real", caption.get_text(), re.IGNORECASE), (
+                f"{page}: {caption.get_text()}"
+            )
+
+
+def test_no_page_shows_an_error_or_a_missing_number(html: Path) -> None:
+    for page in pages_of(html):
+        article = read_page(page).find("article") or read_page(page)
+        assert not article.select(".output.stderr, .output.traceback, .system-message, .problematic"), (
+            page.name
+        )
+        words = article.get_text()
+        assert "Traceback (most recent call last)" not in words, page.name
+        assert not re.search(r"\{(glue|numref|ref|eq|cite|doc)[:}]", words), page.name
+        numbers = [number.get_text().strip() for number in article.select(".pasted-text")]
+        assert "nan" not in numbers and "" not in numbers, page.name
+
+
+def test_no_page_needs_a_network(html: Path) -> None:
+    for page in pages_of(html):
+        soup = read_page(page)
+        loaded = [tag.get("src", "") for tag in soup.find_all(["script", "img", "iframe", "video", "source"])]
+        loaded += [
+            tag["href"] for tag in soup.find_all("link", href=True) if "stylesheet" in tag.get("rel", [])
+        ]
+        outside = [
+            address
+            for address in loaded
+            if address and not address.startswith("data:") and not is_inside(address)
+        ]
+        assert not outside, f"{page.name}: loads {outside}"
+    assert (html / "_static" / "mathjax" / "tex-chtml.js").is_file()
+
+
+def test_first_page_shows_the_result_and_the_three_doors(html: Path) -> None:
+    article = read_page(html / "intro.html").article
+    assert any("result" in image["src"] for image in article.find_all("img"))
+    links = {link["href"].split("#")[0] for link in article.find_all("a", href=True)}
+    assert {"notebooks/01_sessions.html", "rerun.html", "take.html"} <= links

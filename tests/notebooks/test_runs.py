@@ -1,0 +1,82 @@
+"""What papermill's runs of a profile left behind, and one chapter run again by hand."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from chapters import (
+    ROOT,
+    all_runs,
+    faults_of_run,
+    load_config,
+    papermill_arguments,
+    read_notebook,
+    run_parameters,
+)
+
+METRICS = {
+    *("method", "session", "n_scans", "failures", "rmse_m", "rmse_yaw_deg"),
+    *("within_1m_2deg", "within_2m_5deg", "within_5m_10deg", "update_ms_median", "seed"),
+}
+
+
+def test_every_run_is_there_and_without_fault(profile: dict) -> None:
+    for run in all_runs(profile):
+        path = run.path(profile["out_dir"])
+        assert faults_of_run(read_notebook(path)) == [], path
+
+
+def test_every_localization_run_wrote_its_files(profile: dict) -> None:
+    for session in profile["sessions"][1:]:
+        for method in profile["methods"]:
+            check_localization(Path(profile["out_dir"], "localization", session, method), session, method)
+
+
+def check_localization(folder: Path, session: str, method: str) -> dict:
+    metrics = json.loads((folder / "metrics.json").read_text())
+    assert METRICS <= set(metrics)
+    assert (metrics["session"], metrics["method"]) == (session, method)
+    for name in ("trajectory.tum", "truth.tum"):
+        rows = [line for line in (folder / name).read_text().splitlines() if not line.startswith("#")]
+        assert len(rows) == metrics["n_scans"] and all(len(row.split()) == 8 for row in rows), name
+    return metrics
+
+
+@pytest.mark.parametrize("profile", ["smoke"], indirect=True)
+def test_one_session_runs_again_alone_with_the_same_numbers(profile: dict, tmp_path: Path) -> None:
+    """The README's command for one chapter and one session; same seed, same numbers."""
+    run = next(run for run in all_runs(profile) if run.chapter == "07_localization")
+    parameters = run_parameters(profile, run) | {"out_dir": str(tmp_path / "again")}
+    command = f"{sys.executable} -m papermill notebooks/07_localization.ipynb {tmp_path}/07.ipynb --no-progress-bar "
+    command += "--kernel python3 " + papermill_arguments(parameters)
+    answer = subprocess.run(
+        command, shell=True, cwd=ROOT, capture_output=True, text=True, check=False, env=environment()
+    )
+    assert answer.returncode == 0, answer.stderr[-3000:]
+    folder = Path("localization", run.session, run.method)
+    first = check_localization(Path(profile["out_dir"]) / folder, run.session, run.method)
+    second = check_localization(tmp_path / "again" / folder, run.session, run.method)
+    for metrics in (first, second):
+        del metrics["update_ms_median"]  # a time
+    assert first == second
+    for name in ("trajectory.tum", "truth.tum"):
+        assert (Path(profile["out_dir"]) / folder / name).read_bytes() == (
+            tmp_path / "again" / folder / name
+        ).read_bytes()
+
+
+def environment() -> dict[str, str]:
+    """The environment of a reader who draws into the notebook, not of a test run that draws nowhere."""
+    return {k: v for k, v in os.environ.items() if k != "MPLBACKEND"} | {
+        "NUMBA_NUM_THREADS": "1",
+        "OMP_NUM_THREADS": "1",
+    }
+
+
+def test_profiles_name_the_same_chapters() -> None:
+    smoke, demo = (load_config(ROOT / "config" / f"{name}.yaml") for name in ("smoke", "demo"))
+    assert all_runs(smoke) == all_runs(demo)

@@ -1,0 +1,354 @@
+"""What the workflow knows of the chapters: which runs there are, their parameters, and when a run is out of date.
+
+The Snakefile, the staging of the book, the renewing of the stored notebooks and the tests all read it here; no path of
+an executed notebook is written anywhere else.
+"""
+
+from __future__ import annotations
+
+import ast
+import hashlib
+import io
+import json
+import shlex
+import tokenize
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+import nbformat
+import yaml
+
+ROOT = Path(__file__).resolve().parents[1]
+NOTEBOOKS = ROOT / "notebooks"
+PACKAGE = ROOT / "src" / "rol"
+
+# How often a chapter runs: once in all, once for each session, or once for each localization session and method.
+CHAPTERS = {
+    "01_sessions": "once",
+    "02_alignment": "session",
+    "03_ground_removal": "session",
+    "04_pix2pix": "once",
+    "05_real_vs_fake": "once",
+    "06_ground_truth": "once",
+    "07_localization": "method",
+    "08_results": "once",
+}
+CONFIG_KEYS = {
+    "profile",
+    "sessions_root",
+    "sessions",
+    "methods",
+    "out_dir",
+    "book_dir",
+    "seed",
+    "notebooks",
+    "virtual",
+}
+OPTIONAL_KEYS = {"real_root"}
+
+
+class ChapterError(ValueError):
+    """A chapter, its parameters or its run is not as it must be; the message names the file and the fault."""
+
+
+@dataclass(frozen=True)
+class Run:
+    """One run of a chapter: the chapter and, where it has them, its session and its method."""
+
+    chapter: str
+    session: str = ""
+    method: str = ""
+
+    def path(self, out_dir: str | Path) -> Path:
+        """Say where the executed notebook lies."""
+        parts = [part for part in (self.chapter, self.session, self.method) if part]
+        return Path(out_dir, "notebooks", *parts[:-1], f"{parts[-1]}.ipynb")
+
+
+def load_config(path: str | Path) -> dict:
+    """Read a profile and check its keys.
+
+    Raises
+    ------
+    ChapterError
+        If a key is missing or nobody reads it, or a chapter named in it does not exist.
+    """
+    return check_config(yaml.safe_load(Path(path).read_text()), str(path))
+
+
+def check_config(config: dict, name: str) -> dict:
+    """Check that a profile has every key that is needed and none that nobody reads."""
+    missing, unknown = CONFIG_KEYS - set(config), set(config) - CONFIG_KEYS - OPTIONAL_KEYS
+    if missing or unknown:
+        raise ChapterError(f"{name}: missing keys {sorted(missing)}, unknown keys {sorted(unknown)}")
+    strangers = set(config["notebooks"] or {}) - set(CHAPTERS)
+    if strangers:
+        raise ChapterError(f"{name}: no such chapters: {sorted(strangers)}")
+    if len(config["sessions"]) < 2 or len(set(config["sessions"])) != len(config["sessions"]):
+        raise ChapterError(
+            f"{name}: `sessions` needs at least two different names, the training session first"
+        )
+    return config
+
+
+def all_runs(config: dict) -> list[Run]:
+    """List every run of a profile in the order of the chapters."""
+    runs = []
+    for chapter, often in CHAPTERS.items():
+        if often == "once":
+            runs.append(Run(chapter))
+        elif often == "session":
+            runs += [Run(chapter, session) for session in config["sessions"]]
+        else:
+            runs += [Run(chapter, s, m) for s in config["sessions"][1:] for m in config["methods"]]
+    return runs
+
+
+def book_pages(config: dict) -> dict[str, Run]:
+    """Give the runs that the book shows, by page name.
+
+    A chapter that runs for every session is shown for the training session; the localization is shown for all.
+    """
+    pages = {}
+    for run in all_runs(config):
+        if CHAPTERS[run.chapter] == "method":
+            more = [run.session] + ([run.method] if len(config["methods"]) > 1 else [])
+            pages["-".join([run.chapter, *more])] = run
+        elif run.session in ("", config["sessions"][0]):
+            pages[run.chapter] = run
+    return pages
+
+
+# ---- parameters -----------------------------------------------------------------------------------------------
+
+
+def read_notebook(path: str | Path) -> nbformat.NotebookNode:
+    """Read a notebook; an unreadable one is an error that names the file."""
+    try:
+        return nbformat.read(path, as_version=4)
+    except (OSError, nbformat.reader.NotJSONError, nbformat.ValidationError) as error:
+        raise ChapterError(f"{path}: not a readable notebook ({error})") from error
+
+
+def tagged_cells(notebook: nbformat.NotebookNode, tag: str) -> list[nbformat.NotebookNode]:
+    """List the cells that carry a tag."""
+    return [cell for cell in notebook.cells if tag in cell.metadata.get("tags", [])]
+
+
+def literal_assignments(source: str, name: str) -> dict:
+    """Read a cell of plain assignments of literals; anything else in it is an error."""
+    values = {}
+    for node in ast.parse(source).body:
+        if not isinstance(node, ast.Assign) or not isinstance(node.targets[0], ast.Name):
+            raise ChapterError(f"{name}: line {node.lineno} of the parameters cell is not `name = literal`")
+        try:
+            values[node.targets[0].id] = ast.literal_eval(node.value)
+        except ValueError as error:
+            raise ChapterError(f"{name}: parameter `{node.targets[0].id}` is not a plain literal") from error
+    return values
+
+
+def notebook_parameters(path: str | Path) -> dict:
+    """Give the parameters of a notebook with their defaults.
+
+    Raises
+    ------
+    ChapterError
+        If there is not exactly one cell tagged ``parameters``, it is not the first code cell, or it holds more than
+        literals.
+    """
+    notebook = read_notebook(path)
+    cells = tagged_cells(notebook, "parameters")
+    code = [cell for cell in notebook.cells if cell.cell_type == "code"]
+    if len(cells) != 1 or not code or code[0] is not cells[0]:
+        raise ChapterError(f"{path}: needs exactly one cell tagged `parameters`, as its first code cell")
+    return literal_assignments(cells[0].source, str(path))
+
+
+def run_parameters(config: dict, run: Run, notebooks: Path = NOTEBOOKS) -> dict:
+    """Give what papermill passes to a run.
+
+    The common settings go to every notebook that asks for them; the knobs of the profile and the session and method
+    of the run must be parameters of the notebook (papermill itself would only print a line and go on).
+
+    Raises
+    ------
+    ChapterError
+        If a name is not a parameter of the notebook.
+    """
+    path = notebooks / f"{run.chapter}.ipynb"
+    known = notebook_parameters(path)
+    common = {
+        key: config[key]
+        for key in ("sessions_root", "sessions", "out_dir", "seed", "real_root")
+        if key in config
+    }
+    common["in_dir"] = config["out_dir"]
+    own = {key: value for key, value in (("session", run.session), ("method", run.method)) if value}
+    own |= (config["notebooks"] or {}).get(run.chapter) or {}
+    unknown = sorted(set(own) - set(known))
+    if unknown:
+        raise ChapterError(
+            f"{path}: has no parameter {', '.join(unknown)}; it has {', '.join(sorted(known))}"
+        )
+    return {key: value for key, value in (common | own).items() if key in known}
+
+
+def papermill_arguments(parameters: dict) -> str:
+    """Write parameters as papermill's arguments, quoted for the shell.
+
+    Strings go by ``-r``, since ``-p`` turns 007 into 7; all else goes as YAML by ``-y``.
+    """
+    words = []
+    for name, value in parameters.items():
+        if isinstance(value, str):
+            words += ["-r", name, value]
+        else:
+            words += ["-y", yaml.safe_dump({name: value}, default_flow_style=True, width=10**6).strip()]
+    return shlex.join(words)
+
+
+# ---- digests --------------------------------------------------------------------------------------------------
+
+
+def code_text(source: str) -> str:
+    """Reduce Python source to what can change a result: without comments, docstrings and blank lines."""
+    lines = source.splitlines()
+    for token in tokenize.generate_tokens(io.StringIO(source).readline):
+        if token.type == tokenize.COMMENT:
+            row, column = token.start
+            lines[row - 1] = lines[row - 1][:column]
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(
+            node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef
+        ) and ast.get_docstring(node):
+            first, last = node.body[0].lineno, node.body[0].end_lineno
+            lines[first - 1 : last] = [""] * (last - first + 1)
+    return "\n".join(line.rstrip() for line in lines if line.strip())
+
+
+def code_cells(notebook: nbformat.NotebookNode) -> list[str]:
+    """List the sources of a notebook's code cells, without the one that papermill put in."""
+    injected = tagged_cells(notebook, "injected-parameters")
+    return [
+        c.source for c in notebook.cells if c.cell_type == "code" and c.source.strip() and c not in injected
+    ]
+
+
+def imported_modules(source: str, package: tuple[str, ...] = ()) -> set[tuple[str, ...]]:
+    """List the names below ``rol`` that a piece of source imports, as paths such as ``("virtual", "scene")``.
+
+    Parameters
+    ----------
+    source : str
+        Python source; lines of IPython's magic are left out.
+    package : tuple of str
+        Where the source stands below ``rol``, to resolve relative imports.
+    """
+    plain = "\n".join(line for line in source.splitlines() if not line.lstrip().startswith(("%", "!")))
+    found = set()
+    for node in ast.walk(ast.parse(plain)):
+        if isinstance(node, ast.Import):
+            names = [tuple(alias.name.split(".")) for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            base = tuple(node.module.split(".")) if node.module else ()
+            if node.level:
+                base = ("rol", *package[: len(package) - node.level + 1], *base)
+            names = [base] + [(*base, alias.name) for alias in node.names]
+        else:
+            continue
+        found |= {name[1:] for name in names if name[:1] == ("rol",)}
+    return found
+
+
+def module_files(sources: Iterable[str], package_root: Path = PACKAGE) -> list[Path]:
+    """List the files of ``rol`` that pieces of source use, directly or through one another."""
+    found: set[Path] = set()
+    waiting = [name for source in sources for name in imported_modules(source)]
+    while waiting:
+        name = waiting.pop()
+        for file in (
+            package_root.joinpath(*name, "__init__.py"),
+            package_root.joinpath(*name).with_suffix(".py"),
+        ):
+            if file.is_file() and file not in found:
+                found.add(file)
+                package = file.parent.relative_to(package_root).parts
+                waiting += imported_modules(file.read_text(), package)
+    return sorted(found)
+
+
+def digest(texts: Iterable[str]) -> str:
+    """Give a short digest of several texts."""
+    return hashlib.sha256("\0".join(texts).encode()).hexdigest()[:16]
+
+
+def chapter_digest(path: str | Path) -> str:
+    """Give the digest of a notebook's code and of the modules it uses; text, comments and outputs do not count."""
+    cells = code_cells(read_notebook(path))
+    return digest([*cells, *(code_text(file.read_text()) for file in module_files(cells))])
+
+
+def virtual_digest() -> str:
+    """Give the digest of all code that makes virtual sessions."""
+    files = module_files(["import rol.virtual.__main__"])
+    return digest(code_text(file.read_text()) for file in files)
+
+
+def stored_digest(notebook: nbformat.NotebookNode, config: dict) -> str:
+    """Give the digest that a stored notebook carries: its code, all of ``src/rol``, and the profile it was run with."""
+    package = [code_text(file.read_text()) for file in sorted(PACKAGE.rglob("*.py"))]
+    return digest([*code_cells(notebook), *package, json.dumps(config, sort_keys=True)])
+
+
+# ---- executed notebooks ---------------------------------------------------------------------------------------
+
+
+def faults_of_run(notebook: nbformat.NotebookNode) -> list[str]:
+    """List what is wrong with an executed notebook: a cell that did not run, an error, or words on stderr."""
+    faults = []
+    for number, cell in enumerate(notebook.cells):
+        if cell.cell_type != "code" or not cell.source.strip():
+            continue
+        if cell.execution_count is None:
+            faults.append(f"cell {number} did not run")
+        for output in cell.outputs:
+            if output.output_type == "error":
+                faults.append(f"cell {number} raised {output.ename}: {output.evalue}")
+            elif output.get("name") == "stderr":
+                faults.append(f"cell {number} wrote to stderr: {output.text.strip()[:200]}")
+    return faults
+
+
+def load_run(path: str | Path, source: str | Path) -> nbformat.NotebookNode:
+    """Load an executed notebook with the text of its source as it is now.
+
+    Text cells may have changed since the run and are taken from the source; code cells must be the same.
+
+    Raises
+    ------
+    ChapterError
+        If the run has a fault or its code is not that of the source.
+    """
+    executed, current = read_notebook(path), read_notebook(source)
+    faults = faults_of_run(executed)
+    if faults:
+        raise ChapterError(f"{path}: " + "; ".join(faults))
+    if code_cells(executed) != code_cells(current):
+        raise ChapterError(f"{path}: its code is not that of {source}; run the chapter again")
+    injected = tagged_cells(executed, "injected-parameters")
+    ran = iter(
+        [c for c in executed.cells if c.cell_type == "code" and c.source.strip() and c not in injected]
+    )
+    cells = []
+    for cell in current.cells:
+        if cell.cell_type == "code" and cell.source.strip():
+            done = next(ran)
+            cell.outputs, cell.execution_count = done.outputs, done.execution_count
+        cells.append(cell)
+        if "parameters" in cell.metadata.get("tags", []):
+            cells += injected
+    current.cells = cells
+    current.metadata.setdefault("papermill", {}).update(executed.metadata.get("papermill", {}))
+    return current
