@@ -28,7 +28,7 @@ def build_walls(rng: np.random.Generator) -> np.ndarray:
 def drive(offset: tuple[float, float, float], step_m: float) -> np.ndarray:
     """Give the poses (n, 3) of a drive around two blocks with rounded corners, begun at an offset."""
     straight = [(step_m, 0.0, 0.0)] * int(100 / step_m)
-    bend = [(step_m, 0.0, step_m / 10.0)] * int(round(np.pi / 2 * 10.0 / step_m))
+    bend = [(step_m, 0.0, step_m / 10.0)] * round(np.pi / 2 * 10.0 / step_m)
     steps = np.array((straight + bend) * 2 + straight)
     return accumulate_steps(steps, compose((70.0, 60.0, 0.0), offset))
 

@@ -8,8 +8,8 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
-from rol.fakes import finish_fakes, list_fakes, prepare_fakes, read_image, write_fakes  # noqa: E402
-from rol.pix2pix import build_generator, generate  # noqa: E402
+from rol.fakes import finish_fakes, list_fakes, prepare_fakes, read_image, write_fakes
+from rol.pix2pix import build_generator, generate
 
 pytestmark = pytest.mark.torch
 STAMPS = [1_000_000, 1_250_000, 1_500_000]

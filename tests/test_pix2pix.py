@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 torch = pytest.importorskip("torch")
-from safetensors.torch import save_file  # noqa: E402
-from torch import nn  # noqa: E402
+from safetensors.torch import save_file
+from torch import nn
 
-from rol.pix2pix import (  # noqa: E402
+from rol.pix2pix import (
     ARCHITECTURE,
     Pix2PixError,
     TrainConfig,

@@ -9,8 +9,8 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
-from rol.pix2pix import TrainConfig, load_metadata, load_weights  # noqa: E402
-from rol.training import TrainingError, learning_rate, pick_pairs, train  # noqa: E402
+from rol.pix2pix import TrainConfig, load_metadata, load_weights
+from rol.training import TrainingError, learning_rate, pick_pairs, train
 
 pytestmark = pytest.mark.torch
 TINY = TrainConfig(filters=2, blocks=1, discriminator_filters=2, steps=12, report_every=1, checkpoint_every=4)

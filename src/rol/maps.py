@@ -85,7 +85,7 @@ def accumulate_map(
     if len(thinned) != len(poses):
         raise MapError(f"{len(thinned)} clouds for {len(poses)} poses")
     points = np.concatenate(thinned) if thinned else np.zeros((0, 2))
-    cells, inverse, hits = _unique_cells(points, cell)
+    _, inverse, hits = _unique_cells(points, cell)
     if not (hits >= min_hits).any():
         raise MapError(f"the map is empty: no cell is hit by {min_hits} of {len(poses)} clouds")
     sums = np.stack([np.bincount(inverse, points[:, k], len(hits)) for k in range(2)], axis=1)

@@ -98,7 +98,7 @@ def surface_table() -> np.ndarray:
     """Give the rows of `SURFACES` in the order of `Material`, shape (n_materials, 3)."""
     from .mesh import Material
 
-    return np.array([SURFACES.get(material.name, (0.0, 1.0, 0.0)) for material in Material])
+    return np.array([SURFACES.get(m.name, (0.0, 1.0, 0.0)) for m in Material], dtype=np.float32)
 
 
 def schedule_firings(
@@ -206,22 +206,25 @@ def simulate_sweep(
     """
     settings = settings or LidarSettings()
     hits = scene.cast(sweep_rays(angles, T_radar_lidar, poses, height))
-    r, material, n = hits.t.astype(np.float64), hits.material, len(hits.t)
+    reached = np.flatnonzero(hits.t < settings.max_range_m)
+    r, cosine, material = hits.t[reached], hits.cos_incidence[reached], hits.material[reached]
     reflectivity, lost_share, softness = surface_table()[material].T
-    with np.errstate(divide="ignore"):
-        power = reflectivity * hits.cos_incidence / np.maximum(r, 1.0) ** 2
-    faintest = (
-        0.1 / settings.reach_m**2 * np.exp(rng.normal(0.0, 0.35, n))
-    )  # the threshold varies: no sharp edge
-    is_lost = rng.random(n) < 1.0 - (1.0 - lost_share) * (1.0 - settings.lost_share)
-    noise = rng.normal(0.0, 1.0, n) * settings.range_noise_m + np.abs(rng.normal(0.0, 1.0, n)) * softness
-    r = np.where(np.isfinite(r), r, 0.0) + noise
-    is_seen = (power > faintest) & ~is_lost & (r > 0.9) & (r < settings.max_range_m)
-    ranges = np.where(is_seen, np.rint(r / RANGE_UNIT), 0.0).astype(np.uint16)
-    shade = 100.0 * reflectivity * (0.5 + 0.5 * hits.cos_incidence) * np.exp(rng.normal(0.0, 0.15, n))
-    intensities = np.where(is_seen, np.clip(shade, 1.0, 255.0), 0.0).astype(np.uint8)
+    draws = rng.standard_normal((4, len(reached)), dtype=np.float32)
+    # The weakest return that is noticed varies, so that surfaces fade out without a sharp edge.
+    faintest = 0.1 / settings.reach_m**2 * np.exp(0.35 * draws[0])
+    is_lost = rng.random(len(reached), dtype=np.float32) > (1.0 - lost_share) * (1.0 - settings.lost_share)
+    is_seen = (reflectivity * cosine > faintest * np.maximum(r, 1.0) ** 2) & ~is_lost
+    r = r + settings.range_noise_m * draws[1] + np.abs(draws[2]) * softness
+    is_seen &= (r > 0.9) & (r < settings.max_range_m)
+    shade = 100.0 * reflectivity * (0.5 + 0.5 * cosine) * np.exp(0.15 * draws[3])
+    seen = reached[is_seen]
+    intensities, ranges, materials = (
+        np.zeros(len(hits.t), dtype=kind) for kind in (np.uint8, np.uint16, np.uint8)
+    )
+    intensities[seen] = np.clip(shade[is_seen], 1.0, 255.0)
+    ranges[seen] = np.rint(r[is_seen] / RANGE_UNIT)
+    materials[seen] = material[is_seen]
     shape = (len(ELEVATIONS_DOWN), len(angles))
-    materials = np.where(is_seen, material, 0).astype(np.uint8)
     return Sweep(
         intensities.reshape(shape), ranges.reshape(shape), angles, stamps_us, materials.reshape(shape)
     )

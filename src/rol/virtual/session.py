@@ -77,11 +77,11 @@ class VirtualSession:
             [self.settings.seed, self.settings.sessions[self.name].seed, part, index]
         )
 
-    def scene_at(self, stamp_us: float) -> Scene:
-        """Give the town with everything that moves where it is at one time [us]."""
+    def scene_at(self, stamp_us: float, radius: float = 170.0) -> Scene:
+        """Give the town with everything that moves within a radius [m] where it is at one time [us]."""
         middle = self.drive.pose(np.array([stamp_us]))[0]
         return self.scene.with_moving(
-            self.traffic.meshes_at(self.town.plan, stamp_us, self.first_mover, middle)
+            self.traffic.meshes_at(self.town.plan, stamp_us, self.first_mover, middle, radius)
         )
 
 
@@ -227,7 +227,7 @@ def make_sweep(session: VirtualSession, sensor: str, index: int) -> Sweep:
     height = session.settings.radar_height_m + session.town.plan.ground(poses[:1, :2])[0]
     T_radar_lidar = np.linalg.inv(EXTRINSICS["radar"]) @ EXTRINSICS[sensor]
     settings, _ = sensor_settings(session.settings)
-    scene = session.scene_at(float(stamps[len(stamps) // 2]))
+    scene = session.scene_at(float(stamps[len(stamps) // 2]), settings.max_range_m + 10.0)
     return simulate_sweep(scene, stamps, angles, T_radar_lidar, poses, float(height), rng, settings)
 
 
