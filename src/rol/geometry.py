@@ -111,7 +111,9 @@ def relative_pose(T_w_a: np.ndarray, T_w_b: np.ndarray) -> np.ndarray:
     return compose(invert(T_w_a), T_w_b)
 
 
-def accumulate_steps(steps: np.ndarray, start: np.ndarray | tuple[float, float, float] = (0.0, 0.0, 0.0)) -> np.ndarray:
+def accumulate_steps(
+    steps: np.ndarray, start: np.ndarray | tuple[float, float, float] = (0.0, 0.0, 0.0)
+) -> np.ndarray:
     """Chain body-frame steps into a trajectory.
 
     Parameters
