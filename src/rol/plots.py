@@ -595,3 +595,194 @@ def draw_dots(ax: Axes, values: Sequence[np.ndarray], names: Sequence[str], *, c
     ax.set_xticks(range(len(names)), names)
     ax.grid(False, axis="x")
     return ax
+
+
+# ---- sessions (chapter 01) ----
+
+
+def draw_routes(ax: Axes, ways: Sequence[np.ndarray], names: Sequence[str]) -> Axes:
+    """Draw the ways of several sessions on the ground, a dot at each start.
+
+    Parameters
+    ----------
+    ax : Axes
+        Where to draw.
+    ways : sequence of array, shape (n, 2)
+        East and north of each session [m].
+    names : sequence of str
+        Names for the legend.
+
+    Returns
+    -------
+    ax : Axes
+        The axes.
+    """
+    for index, (way, name) in enumerate(zip(ways, names, strict=True)):
+        line = ax.plot(way[:, 0], way[:, 1], color=SERIES[index % len(SERIES)], linewidth=1.4, label=name)[0]
+        ax.plot(*way[0], "o", color=line.get_color(), markersize=5)
+    ax.set_aspect("equal", adjustable="datalim")
+    ax.set(title="positions of gps.csv", xlabel="east [m]", ylabel="north [m]")
+    return ax
+
+
+def draw_speeds(ax: Axes, drives: Sequence[tuple[np.ndarray, np.ndarray]], names: Sequence[str]) -> Axes:
+    """Draw the speeds of several sessions over time, one strip for each.
+
+    Parameters
+    ----------
+    ax : Axes
+        Where to draw.
+    drives : sequence of (stamps, poses), shapes (n,) and (n, 3)
+        Times [us] and poses [m, m, rad] of each session.
+    names : sequence of str
+        Names for the strips.
+
+    Returns
+    -------
+    ax : Axes
+        The axes.
+    """
+    for index, (stamps_us, poses) in enumerate(drives):
+        seconds = np.diff(stamps_us) / 1e6
+        speeds = np.hypot(*np.diff(poses[:, :2], axis=0).T) / seconds
+        base = -12.0 * index
+        times = (stamps_us[1:] - stamps_us[0]) / 1e6
+        colour = SERIES[index % len(SERIES)]
+        ax.fill_between(times, base, base + speeds, color=colour, alpha=0.85, linewidth=0)
+        ax.text(0.0, base + 9.2, names[index], fontsize=9.5, color=colour)
+    ax.set(
+        title="speed; a strip is 12 m/s high",
+        xlabel="time since the first scan [s]",
+        ylim=(-12.0 * len(drives) + 11.0, 12.5),
+    )
+    ax.set_yticks([-12.0 * i for i in range(len(drives))], ["0"] * len(drives))
+    return ax
+
+
+def draw_polar(
+    ax: Axes, codes: np.ndarray, *, bin_m: float, offset_m: float, max_range: float = 164.0
+) -> Axes:
+    """Draw a radar scan as it is stored: a row per azimuth, range to the right.
+
+    Parameters
+    ----------
+    ax : Axes
+        Where to draw.
+    codes : array, shape (400, 3768)
+        Power codes of half a decibel.
+    bin_m, offset_m, max_range : float
+        Length of a bin, range offset, and where to stop [m].
+
+    Returns
+    -------
+    ax : Axes
+        The axes.
+    """
+    shown = ax.imshow(
+        codes, cmap="gray_r", aspect="auto", vmin=0, vmax=110, extent=(offset_m, offset_m + bin_m * codes.shape[1], 360, 0),
+        interpolation="antialiased",
+    )  # fmt: skip
+    ax.set(
+        title="as stored",
+        xlabel="range [m]",
+        ylabel="azimuth, clockwise from ahead [deg]",
+        xlim=(0, max_range),
+    )
+    ax.set_yticks(np.arange(0, 361, 90))
+    ax.grid(False)
+    ax.figure.colorbar(shown, ax=ax, label="power code [0.5 dB]", shrink=0.8)
+    return ax
+
+
+def draw_range_image(ax: Axes, ranges: np.ndarray, *, max_range: float = 50.0) -> Axes:
+    """Draw the ranges of a sweep as stored: a row per laser, a column per firing; white where nothing came back.
+
+    Parameters
+    ----------
+    ax : Axes
+        Where to draw.
+    ranges : array, shape (32, n)
+        Ranges, the highest laser first, zero where nothing came back [m].
+    max_range : float
+        End of the colour scale [m].
+
+    Returns
+    -------
+    ax : Axes
+        The axes.
+    """
+    shown = ax.imshow(
+        np.where(ranges > 0, ranges, np.nan), cmap="viridis_r", aspect="auto", vmin=0, vmax=max_range
+    )
+    ax.set(title="as stored", xlabel="firing", ylabel="laser")
+    ax.grid(False)
+    ax.figure.colorbar(shown, ax=ax, label="range [m]")
+    return ax
+
+
+def draw_view(ax: Axes, picture: np.ndarray, *, title: str = "") -> Axes:
+    """Show a rendered picture without axes.
+
+    Parameters
+    ----------
+    ax : Axes
+        Where to draw.
+    picture : array, shape (h, w, 3)
+        Colours between 0 and 1.
+    title : str
+        Words above.
+
+    Returns
+    -------
+    ax : Axes
+        The axes.
+    """
+    ax.imshow(picture, interpolation="antialiased")
+    ax.set_title(title)
+    ax.set_axis_off()
+    return ax
+
+
+def draw_plan(
+    ax: Axes,
+    picture: np.ndarray,
+    centre: Sequence[float],
+    half: float,
+    *,
+    way: np.ndarray,
+    pose: np.ndarray,
+    title: str = "",
+) -> Axes:
+    """Show a rendered plan with a way on it and one pose as an arrow.
+
+    Parameters
+    ----------
+    ax : Axes
+        Where to draw.
+    picture : array, shape (n, n, 3)
+        The plan: row 0 at the largest y, column 0 at the smallest x.
+    centre : sequence of two floats
+        Middle of the plan [m].
+    half : float
+        Half its edge [m].
+    way : array, shape (n, 3)
+        Poses along the way [m, m, rad].
+    pose : array, shape (3,)
+        The pose to point out.
+    title : str
+        Words above.
+
+    Returns
+    -------
+    ax : Axes
+        The axes.
+    """
+    extent = (centre[0] - half, centre[0] + half, centre[1] - half, centre[1] + half)
+    ax.imshow(picture, extent=extent, interpolation="antialiased")
+    ax.plot(way[:, 0], way[:, 1], color=COLOURS["estimate"], linewidth=1.8)
+    arrow = {"arrowstyle": "-|>", "color": "black", "linewidth": 2.0}
+    tip = pose[:2] + 16.0 * np.array([np.cos(pose[2]), np.sin(pose[2])])
+    ax.annotate("", xy=tip, xytext=pose[:2], arrowprops=arrow)
+    ax.set(title=title, xlabel="town x [m]", ylabel="town y [m]", xlim=extent[:2], ylim=extent[2:])
+    ax.grid(False)
+    return ax
