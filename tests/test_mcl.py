@@ -87,19 +87,28 @@ def test_count_matches_refuses_other_grids_and_bad_points():
         mcl.count_matches(np.full((1, 3), np.nan), CLOUD, MATCHED, ORIGIN, 1.0)
 
 
-def test_distance_table_agrees_with_scipy():
+def test_matched_grid_agrees_with_scipy():
     rng = np.random.default_rng(2)
     points = rng.uniform(-5, 9, (40, 2))
-    distances, origin = mcl.distance_table(points, cell=0.25, max_distance=2.0)
-    centres = origin + (np.stack(np.indices(distances.shape), axis=-1) + 0.5) * 0.25
-    expected = np.minimum(cKDTree(points).query(centres)[0], 2.0)
-    np.testing.assert_allclose(distances, expected, atol=1e-5)
-    # points on cell centres: the transform of the occupied cells is exact as well
+    grid = mcl.build_matched_grid(points, d_th=0.9, cell=0.25)
+    centres = grid.origin + (np.stack(np.indices(grid.values.shape), axis=-1) + 0.5) * 0.25
+    np.testing.assert_array_equal(grid.values, cKDTree(points).query(centres)[0] < 0.9)
+    # points on cell centres: the exact distance transform of the occupied cells says the same
     points = (rng.integers(0, 30, (25, 2)) + 0.5) * 0.25
-    distances, origin = mcl.distance_table(points, cell=0.25, max_distance=2.0)
-    is_free = np.ones(distances.shape, dtype=bool)
-    is_free[tuple(np.floor((points - origin) / 0.25).astype(int).T)] = False
-    np.testing.assert_allclose(distances, np.minimum(0.25 * distance_transform_edt(is_free), 2.0), atol=1e-5)
+    grid = mcl.build_matched_grid(points, d_th=0.9, cell=0.25)
+    is_free = np.ones(grid.values.shape, dtype=bool)
+    is_free[tuple(np.floor((points - grid.origin) / 0.25).astype(int).T)] = False
+    np.testing.assert_array_equal(grid.values, 0.25 * distance_transform_edt(is_free) < 0.9)
+
+
+def test_grids_hold_every_matched_place():
+    # beyond the grid nothing is within reach: a point just inside the threshold is still in the grid
+    point = np.array([[3.3, -7.1]])
+    grid = mcl.build_matched_grid(point, d_th=0.5, cell=0.125)
+    inside = np.array([[3.3 + 0.4, -7.1, 0.0], [3.3 - 0.4, -7.1, 0.0], [3.3, -6.7, 0.0], [3.3, -7.5, 0.0]])
+    assert (
+        mcl.count_matches(inside, np.zeros((1, 2)), grid.values, grid.origin, grid.cell).tolist() == [1] * 4
+    )
 
 
 def test_matched_grid_uses_a_strict_threshold():

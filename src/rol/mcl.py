@@ -39,9 +39,9 @@ class MclSettings:
     d_th_m : float
         Matching distance of Eq. 9 [m]. 0.5: two image pixels, about the width of a wall in the map.
     noise_forward_m, noise_side_m, noise_yaw_rad : float
-        Standard deviations added to every step, moving or not [m, m, rad]. 0.2 m and 0.5 deg: the errors of ICP
-        between clouds half of whose points are false. Less than the odometry's own error loses the pose; twice
-        as much costs little.
+        Standard deviations added to every step, moving or not [m, m, rad]. 0.2 m and 0.5 deg: the errors of
+        ICP between clouds half of whose points are false. Less than the odometry's own error loses the pose;
+        twice as much costs little.
     noise_per_m, noise_yaw_per_rad : float
         Standard deviation added per metre driven and per radian turned; 0.03 is twice the 1.5 % by which the
         authors' published odometry is short.
@@ -137,18 +137,22 @@ class MapGrid:
 
 
 @njit(cache=True)
-def _stamp_distances(squares: np.ndarray, points: np.ndarray, reach: float) -> None:
-    """Lower, in place, each cell's squared distance [cells^2] to that of its nearest point [cells]."""
-    h, w = squares.shape
+def _stamp(values: np.ndarray, points: np.ndarray, reach: float, codes: np.ndarray) -> None:
+    """Raise, in place, cells nearer than the reach to a point [cells] to the code of their distance."""
+    h, w = values.shape
     for k in range(points.shape[0]):
         u, v = points[k, 0] - 0.5, points[k, 1] - 0.5
         for i in range(max(0, int(np.ceil(u - reach))), min(h - 1, int(np.floor(u + reach))) + 1):
             for j in range(max(0, int(np.ceil(v - reach))), min(w - 1, int(np.floor(v + reach))) + 1):
-                squares[i, j] = min(squares[i, j], (i - u) ** 2 + (j - v) ** 2)
+                share = ((i - u) ** 2 + (j - v) ** 2) / (reach * reach)
+                if share < 1.0:
+                    values[i, j] = max(values[i, j], codes[int(share * len(codes))])
 
 
-def distance_table(map_points: np.ndarray, cell: float, max_distance: float) -> tuple[np.ndarray, np.ndarray]:
-    """Tabulate the exact distance from each cell's centre to the nearest map point, up to a limit.
+def stamp_grid(
+    map_points: np.ndarray, cell: float, reach: float, codes: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Tabulate a value that falls with the exact distance from a cell's centre to the nearest map point.
 
     Parameters
     ----------
@@ -156,13 +160,15 @@ def distance_table(map_points: np.ndarray, cell: float, max_distance: float) -> 
         Points of the map [m].
     cell : float
         Side of a cell [m].
-    max_distance : float
-        Distances are cut off here, and the table reaches this far beyond the map [m].
+    reach : float
+        Cells from this distance on stay 0, and the grid reaches this far beyond the map [m].
+    codes : array of uint8, shape (k,)
+        Values, not increasing, for k equal parts of the squared distance from 0 to the reach's square.
 
     Returns
     -------
-    distances : array of float32, shape (h, w)
-        Distance of each cell's centre [m].
+    values : array of uint8, shape (h, w)
+        Value of each cell.
     origin : array, shape (2,)
         Corner of cell [0, 0] with the smallest x and y [m].
 
@@ -174,11 +180,11 @@ def distance_table(map_points: np.ndarray, cell: float, max_distance: float) -> 
     map_points = _check_points(map_points, "map")
     if len(map_points) == 0:
         raise MclError("the map holds no point")
-    origin = np.floor((map_points.min(axis=0) - max_distance) / cell) * cell
-    shape = np.ceil((map_points.max(axis=0) + max_distance - origin) / cell).astype(int)
-    squares = np.full(tuple(shape), (max_distance / cell) ** 2, dtype=np.float32)
-    _stamp_distances(squares, (map_points - origin) / cell, max_distance / cell)
-    return np.sqrt(squares, out=squares) * np.float32(cell), origin
+    origin = np.floor((map_points.min(axis=0) - reach) / cell) * cell
+    shape = np.ceil((map_points.max(axis=0) + reach - origin) / cell).astype(int)
+    values = np.zeros(tuple(shape), dtype=np.uint8)
+    _stamp(values, (map_points - origin) / cell, reach / cell, codes)
+    return values, origin
 
 
 def build_matched_grid(map_points: np.ndarray, d_th: float = 0.5, cell: float = 0.125) -> MapGrid:
@@ -198,8 +204,7 @@ def build_matched_grid(map_points: np.ndarray, d_th: float = 0.5, cell: float = 
     grid : MapGrid
         1 where matched, else 0. Yin et al. 2020, Sec. III-B, Eq. 9.
     """
-    distances, origin = distance_table(map_points, cell, max_distance=d_th)
-    return MapGrid((distances < np.float32(d_th)).view(np.uint8), origin, cell)
+    return MapGrid(*stamp_grid(map_points, cell, d_th, np.ones(1, dtype=np.uint8)), cell)
 
 
 def build_likelihood_grid(
@@ -223,10 +228,11 @@ def build_likelihood_grid(
     grid : MapGrid
         log(floor + (1 - floor) exp(-d^2 / 2 sigma^2)) - log(floor), rounded to 255 steps.
     """
-    distances, origin = distance_table(map_points, cell, max_distance=4.0 * sigma)
-    excess = np.log1p((1.0 / floor - 1.0) * np.exp(-0.5 * (distances / sigma) ** 2))
-    scale = -np.log(floor) / 255.0
-    return MapGrid(np.round(excess / scale).astype(np.uint8), origin, cell, float(scale), 255)
+    reach, scale = 4.0 * sigma, -np.log(floor) / 255.0
+    squares = (np.arange(4096) + 0.5) / 4096 * reach**2
+    excess = np.log1p((1.0 / floor - 1.0) * np.exp(-0.5 * squares / sigma**2))
+    codes = np.round(excess / scale).astype(np.uint8)
+    return MapGrid(*stamp_grid(map_points, cell, reach, codes), cell, float(scale), 255)
 
 
 def build_grid(map_points: np.ndarray, settings: MclSettings) -> MapGrid:
