@@ -29,7 +29,7 @@ $(STAMP):
 
 book: $(STAMP)
 	@$(SNAKEMAKE) --unlock --quiet all
-	@time $(SNAKEMAKE) book --rerun-incomplete --retries 1 --scheduler greedy --quiet host reason
+	@time $(SNAKEMAKE) book --prioritize pix2pix --rerun-incomplete --retries 1 --scheduler greedy --quiet host reason
 	@echo "The book: $$($(BIN)/python workflow/stage_book.py --where config/$(PROFILE).yaml) (open it in a browser, no network needed)"
 
 test: $(STAMP) lint

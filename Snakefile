@@ -196,7 +196,7 @@ rule pix2pix:
     params:
         arguments=arguments("04_pix2pix"),
         code=DIGESTS["04_pix2pix"],
-    threads: 2
+    threads: 1  # a second one makes it hardly quicker, and has other chapters to run
     message:
         "04 pix2pix: training"
     shell:

@@ -149,8 +149,8 @@ def test_empty_scan_has_the_noise_of_the_sensor():
     found = statistics.scan_statistics(codes)
     assert found["forbidden"] == 0
     measured = {3.0: 0.45, 28.0: 0.36, 41.0: 0.35, 80.0: 0.40, 106.0: 0.46, 145.0: 0.50}
-    for range_m, share in measured.items():  # real quiet cells hold some clutter too, so fewer zeros
-        assert share - 0.04 < found["zero_shares"][range_m] < share + 0.1
+    for range_m, share in measured.items():  # real quiet cells hold clutter and streaks too, so fewer zeros
+        assert share - 0.04 < found["zero_shares"][range_m] < share + 0.15
     np.testing.assert_allclose(
         found["range_correlation"], [0.93, 0.85, 0.74, 0.61, 0.49, 0.37, 0.28], atol=0.08
     )

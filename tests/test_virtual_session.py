@@ -75,7 +75,7 @@ def test_settings_are_read(recipe: Path) -> None:
         ({"loop_m": float("nan")}, "loop_m: nan is not a finite number"),
         ({"loop_m": 100}, "loop_m: 100.0 is too short"),
         ({"radar_height_m": 0}, "radar_height_m: 0.0 must be positive"),
-        ({"sweeps": "some"}, "sweeps: 'some' is neither 'nearest' nor 'all'"),
+        ({"sweeps": "some"}, "sweeps: 'some' is none of nearest, all, none"),
         ({"labels_every": True}, "labels_every: expected int, got True"),
         ({"lidar": 3}, "lidar: expected dict, got 3"),
         ("town", "expected keys and values, got 'town'"),
@@ -83,7 +83,7 @@ def test_settings_are_read(recipe: Path) -> None:
         ({"sessions": {"virtual-a": {}}}, "session virtual-a: the key 'start' is missing"),
         ({"sessions": {"virtual-a": {"start": "noon"}}}, "start: 'noon' is not a date and time"),
         ({"sessions": {"virtual-a": {"start": START, "scan": 4}}}, "unknown key 'scan'"),
-        ({"sessions": {"virtual-a": {"start": START, "scans": -4}}}, "scans: -4 is too few"),
+        ({"sessions": {"virtual-a": {"start": START, "scans": -4}}}, "scans: -4 must not be negative"),
         ({"sessions": {"virtual-a": {"start": START, "vehicles": -1}}}, "vehicles: -1 must not be negative"),
         ({"sessions": {"virtual-a": {"start": START, "cruise_mps": 0}}}, "cruise_mps: 0.0 must be positive"),
         (
@@ -289,7 +289,7 @@ def test_interrupted_session_goes_on_with_the_same_bytes(folder: Path, recipe: P
     lines: list[str] = []
     writer.write_session(load_settings(recipe), NAME, tmp_path, lines.append)
     assert lines[0] == f"{NAME}: going on with what is there" and lines[-1] == f"{NAME}: complete"
-    assert f"{NAME}: 4 of 4 scans" in lines
+    assert any(line.startswith(f"{NAME}: 4 of 4 scans") for line in lines)
     assert digests(copy) == digests(folder)
     assert scans[0].stat().st_mtime_ns == kept
 

@@ -317,19 +317,21 @@ def test_nobody_drives_through_the_car(town: world.Town, drive) -> None:
     assert len(cars.meshes) == 19
     for stamp in range(STAMP, STAMP + 40_000_000, 200_000):
         own = drive.pose(np.array([stamp]))[0]
-        for mesh, pose in zip(cars.meshes, cars.poses_at(stamp), strict=True):
+        numbers, poses, _ = cars.bodies_at(stamp, own)
+        assert len(numbers) == 19
+        for mesh, pose in zip(cars.meshes, poses, strict=True):
             if np.hypot(*(pose[:2] - own[:2])) < 15.0:
                 size = np.abs(mesh.vertices[:, :2]).max(axis=0)
                 assert not overlaps(np.array([*own, 2.2, 0.9]), np.array([[*pose, *size]])).any()
-    velocities = cars.velocities_at(STAMP + 20e6)
+    velocities = cars.bodies_at(STAMP + 20e6, np.zeros(2))[2]
     assert np.hypot(*velocities.T).max() < 15.0 and np.hypot(*velocities.T).max() > 3.0
-    near = cars.meshes_at(town.plan, STAMP, 1000, np.zeros(2), radius=60.0)
-    everyone = cars.meshes_at(town.plan, STAMP, 1000, np.zeros(2), radius=1e4)
+    near = cars.meshes_at(town.plan.ground, STAMP, 1000, np.zeros(2), radius=60.0)
+    everyone = cars.meshes_at(town.plan.ground, STAMP, 1000, np.zeros(2), radius=1e4)
     assert set(near.objects) < set(everyone.objects) == set(range(1000, 1019))
     nobody = traffic.plan_traffic(
         town.plan, build_route(town.plan), drive, np.random.default_rng(8), n_vehicles=0, n_people=0
     )
-    assert len(nobody.meshes_at(town.plan, STAMP, 0, np.zeros(2)).triangles) == 0
+    assert len(nobody.meshes_at(town.plan.ground, STAMP, 0, np.zeros(2)).triangles) == 0
 
 
 # ---- the lidar ----

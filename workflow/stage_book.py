@@ -62,7 +62,9 @@ def complete_captions(notebook: nbformat.NotebookNode, kind: str) -> None:
     for cell in notebook.cells:
         figure = cell.metadata.get("mystnb", {}).get("figure", {})
         if "caption" in figure and not re.search(
-            r"\b(virtual|real (data|scan|session|route|car))", figure["caption"], re.IGNORECASE
+            r"\b(virtual|real (data|scan|session|route|car))|\{glue:text\}`kind`",
+            figure["caption"],
+            re.IGNORECASE,
         ):
             figure["caption"] = f"{figure['caption'].strip()} {kind} data."
 

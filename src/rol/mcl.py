@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numba import njit, prange
+from numba import get_num_threads, njit, prange
 
 try:
     from .geometry import check_poses, compose, wrap_angle
@@ -256,25 +256,35 @@ def build_grid(map_points: np.ndarray, settings: MclSettings) -> MapGrid:
     return build_likelihood_grid(map_points, settings.sigma_m, settings.floor, settings.cell_m)
 
 
+@njit(cache=True)
 def _sum_values(particles, points, values, x0, y0, cell):
-    """Sum the grid's values under the points as seen from each particle."""
+    """Sum the grid's values under the points as seen from each particle.
+
+    Points outside, particles inside: one point falls on neighbouring cells for all particles of a tracked pose, so
+    the cells that are asked stay in the processor's cache.
+    """
     h, w = values.shape
-    sums = np.empty(particles.shape[0], dtype=np.int64)
-    for i in prange(particles.shape[0]):
-        c, s = np.cos(particles[i, 2]) / cell, np.sin(particles[i, 2]) / cell
-        u0, v0 = (particles[i, 0] - x0) / cell, (particles[i, 1] - y0) / cell
-        total = 0
-        for k in range(points.shape[0]):
-            u = u0 + c * points[k, 0] - s * points[k, 1]
-            v = v0 + s * points[k, 0] + c * points[k, 1]
+    sums = np.zeros(particles.shape[0], dtype=np.int64)
+    c, s = np.cos(particles[:, 2]) / cell, np.sin(particles[:, 2]) / cell
+    u0, v0 = (particles[:, 0] - x0) / cell, (particles[:, 1] - y0) / cell
+    for k in range(points.shape[0]):
+        x, y = points[k, 0], points[k, 1]
+        for i in range(particles.shape[0]):
+            u, v = u0[i] + c[i] * x - s[i] * y, v0[i] + s[i] * x + c[i] * y
             if 0.0 <= u < h and 0.0 <= v < w:
-                total += values[int(u), int(v)]
-        sums[i] = total
+                sums[i] += values[int(u), int(v)]
     return sums
 
 
-_sum_values_serial = njit(_sum_values, cache=True)
-_sum_values_parallel = njit(_sum_values, cache=True, parallel=True)
+@njit(cache=True, parallel=True)
+def _sum_values_parallel(particles, points, values, x0, y0, cell, n_parts):
+    """Do the same with the particles shared out in parts among all threads."""
+    n = particles.shape[0]
+    sums = np.empty(n, dtype=np.int64)
+    for part in prange(n_parts):
+        first, end = part * n // n_parts, (part + 1) * n // n_parts
+        sums[first:end] = _sum_values(particles[first:end], points, values, x0, y0, cell)
+    return sums
 
 
 def count_matches(
@@ -314,8 +324,8 @@ def count_matches(
         raise MclError(
             f"matched: expected a 2D grid of bool or uint8, got {matched.ndim}D of {matched.dtype}"
         )
-    kernel = _sum_values_parallel if parallel else _sum_values_serial
-    return kernel(particles, points, matched.view(np.uint8), float(origin[0]), float(origin[1]), float(cell))
+    given = particles, points, matched.view(np.uint8), float(origin[0]), float(origin[1]), float(cell)
+    return _sum_values_parallel(*given, get_num_threads()) if parallel else _sum_values(*given)
 
 
 def sample_particles(

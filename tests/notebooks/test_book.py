@@ -102,9 +102,7 @@ def test_no_page_shows_an_error_or_a_missing_number(html: Path) -> None:
         assert "Traceback (most recent call last)" not in words, page.name
         assert not re.search(r"\{(glue|numref|ref|eq|cite|doc)[:}]", words), page.name
         numbers = [number.get_text().strip() for number in article.select(".pasted-text")]
-        # The tiny sessions are too short for a drift over 100 m, so "nan" is the right answer there.
-        missing = {""} if "smoke" in html.parts else {"", "nan"}
-        assert not missing & set(numbers), page.name
+        assert not {"", "nan"} & set(numbers), page.name
 
 
 def test_no_page_needs_a_network(html: Path) -> None:

@@ -29,13 +29,16 @@ def main(arguments: list[str] | None = None) -> int:
         "--session", action="append", help="session to write; may be repeated; all of them if not given"
     )
     parser.add_argument("--out", required=True, help="folder of the sessions")
+    parser.add_argument("--jobs", type=int, default=1, help="processes that write at once; 1 if not given")
     given = parser.parse_args(arguments)
     try:
         settings = load_settings(given.config)
         from .writer import write_session
 
         for name in given.session or settings.sessions:
-            write_session(settings, name, given.out, report=lambda line: print(line, flush=True))
+            write_session(
+                settings, name, given.out, report=lambda line: print(line, flush=True), jobs=given.jobs
+            )
     except (ValueError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 1

@@ -112,8 +112,10 @@ def schedule_sweeps(begin_us: int, end_us: int, rng: np.random.Generator) -> np.
     return np.rint(begin + period * np.arange(count) + rng.normal(0.0, 25.0, count)).astype(np.int64)
 
 
-def choose_sweeps(sweeps_us: np.ndarray, scans_us: np.ndarray, turns_us: np.ndarray) -> np.ndarray:
-    """Pick the sweeps nearest to the scans' stamps and to their middles.
+def choose_sweeps(
+    sweeps_us: np.ndarray, scans_us: np.ndarray, turns_us: np.ndarray, kind: str = "nearest"
+) -> np.ndarray:
+    """Pick the sweeps that are written.
 
     Parameters
     ----------
@@ -121,12 +123,16 @@ def choose_sweeps(sweeps_us: np.ndarray, scans_us: np.ndarray, turns_us: np.ndar
         All sweeps [us].
     scans_us, turns_us : array, shape (n,)
         Begin and duration of the scans [us].
+    kind : str
+        "nearest": those nearest to the scans' stamps and to their middles; "all"; "none".
 
     Returns
     -------
     index : array, shape (k,)
         Places of the picked sweeps, in order, each once.
     """
+    if kind != "nearest":
+        return np.arange(len(sweeps_us) if kind == "all" else 0)
     wanted = np.concatenate([scans_us, scans_us + turns_us // 2])
     after = np.clip(np.searchsorted(sweeps_us, wanted), 1, len(sweeps_us) - 1)
     is_before = wanted - sweeps_us[after - 1] <= sweeps_us[after] - wanted

@@ -13,6 +13,8 @@ from numba import njit
 
 CELL = 0.5  # grain of the world along a surface [m]: what a brick pier, a drain pipe, a window frame take up
 MOST_CELLS = 12  # cells that may answer between two neighbouring rays
+ASPECT = np.deg2rad(4.0)  # incidence over which a cell answers alike
+MOST_LATER, LATER_POWER = 8, 4.0  # echoes that came a longer way: how many at most, and of what power each
 WEAKEST = 0.05  # echoes of less power drown in the noise
 
 
@@ -53,12 +55,12 @@ SURFACES = {
     "PAVEMENT": Surface(4e-4, 0.5),
     "GRASS": Surface(4e-3, 0.5),
     "KERB": Surface(0.02, 1.0, 0.2, 6.0),
-    "FACADE": Surface(0.3, 1.0, 100.0, 0.7, 10.0, 0.2, 0.13),
-    "GLASS": Surface(0.05, 1.0, 150.0, 0.7, 10.0, 0.2, 0.17, 0.3),
+    "FACADE": Surface(0.55, 0.15, 8.0, 0.7, 7.0, 0.33, 0.13),
+    "GLASS": Surface(0.05, 1.0, 15.0, 0.7, 7.0, 0.2, 0.17, 0.3),
     "ROOF": Surface(0.05, 1.0, 2.0, 4.0),
-    "WALL": Surface(0.2, 1.0, 50.0, 1.0, 8.0, 0.15, 0.1),
-    "METAL": Surface(1.5, 0.3, 30.0, 3.0, 8.0, 0.2, 0.1),
-    "VEHICLE": Surface(0.2, 0.7, 80.0, 2.0, 15.0, 0.25, 0.12),
+    "WALL": Surface(0.55, 0.15, 6.0, 1.0, 7.0, 0.3, 0.1),
+    "METAL": Surface(0.8, 0.3, 6.0, 3.0, 5.0, 0.2, 0.1),
+    "VEHICLE": Surface(0.2, 0.7, 20.0, 2.0, 8.0, 0.25, 0.12),
     "HEDGE": Surface(0.1, 0.5, passes=0.5),
     "TREE_CROWN": Surface(0.09, 0.3, passes=0.7),
     "TREE_TRUNK": Surface(0.4, 0.3, 1.0, 10.0),
@@ -138,12 +140,12 @@ def scatter(
     """
     n = len(totals)
     turns, ranges = (
-        np.empty(n * (MOST_CELLS + 1), dtype=np.float32),
-        np.empty(n * (MOST_CELLS + 1), dtype=np.float32),
+        np.empty(n * (MOST_CELLS + MOST_LATER), dtype=np.float32),
+        np.empty(n * (MOST_CELLS + MOST_LATER), dtype=np.float32),
     )
     powers, sources = (
-        np.empty(n * (MOST_CELLS + 1), dtype=np.float32),
-        np.empty(n * (MOST_CELLS + 1), dtype=np.int32),
+        np.empty(n * (MOST_CELLS + MOST_LATER), dtype=np.float32),
+        np.empty(n * (MOST_CELLS + MOST_LATER), dtype=np.int32),
     )
     count = 0
     for i in range(n):
@@ -173,10 +175,13 @@ def scatter(
                 turns[count], ranges[count] = _step_aside(headings[i], totals[i], -step * ny, step * nx)
             count += 1
         if together * haze > WEAKEST:
-            turns[count] = 0.06 * (_hash_unit(number, middle, z, 7) - 0.5)
-            ranges[count] = totals[i] + haze_length * _hash_exponential(number, middle, z, 8)
-            powers[count], sources[count] = together * haze * _hash_exponential(number, middle, z, 9), i
-            count += 1
+            n_later = min(MOST_LATER, 1 + int(together * haze / LATER_POWER))
+            for k in range(n_later):
+                turns[count] = 0.06 * (_hash_unit(number, middle, z, 7 + 3 * k) - 0.5)
+                ranges[count] = totals[i] + haze_length * _hash_exponential(number, middle, z, 8 + 3 * k)
+                later = together * haze / n_later * _hash_exponential(number, middle, z, 9 + 3 * k) ** 3 / 6.0
+                powers[count], sources[count] = later, i
+                count += 1
     return turns[:count], ranges[:count], powers[:count], sources[:count]
 
 
@@ -190,17 +195,24 @@ def _step_aside(heading, total, dx, dy):  # pragma: no cover (compiled)
 
 @njit(cache=True)
 def _answer(surface, cosine, number, cell, z):  # pragma: no cover (compiled)
-    """Backscatter of one cell of the world, as a share of a perfect scatterer's."""
+    """Backscatter of one cell of the world, as a share of a perfect scatterer's.
+
+    A cell has a strength of its own, times one that changes every few degrees of incidence: seen from ten metres on, a
+    wall glints elsewhere.
+    """
+    aspect = int(np.arccos(min(cosine, 1.0)) / ASPECT)
     diffuse = (
-        surface[0] * max(cosine, 1e-3) ** surface[1] * 0.75 * _hash_exponential(number, cell, z, 3) ** 1.5
-    )
+        surface[0] * max(cosine, 1e-3) ** surface[1]
+        * _hash_exponential(number, cell, z, 3) * _hash_exponential(number, cell + 7919 * aspect, z, 10)
+    )  # fmt: skip
     specular, corner = 0.0, 0.0
     if surface[2] > 0.0:
         tilt = 0.03 * (_hash_unit(number, cell, z, 1) + _hash_unit(number, cell, z, 2) - 1.0)
         angle = np.arccos(min(cosine, 1.0)) + tilt
         specular = surface[2] * np.exp(-((angle / surface[3]) ** 2))
     if surface[5] > 0.0 and _hash_unit(number, cell, z, 4) < surface[5]:
-        corner = surface[4] * _hash_exponential(number, cell, z, 5) ** 3 / 6.0 * min(1.0, 4.0 * cosine)
+        glint = _hash_exponential(number, cell, z, 5) * _hash_exponential(number, cell + 7919 * aspect, z, 11)
+        corner = surface[4] * glint * min(1.0, 4.0 * cosine)
     return diffuse + specular + corner
 
 

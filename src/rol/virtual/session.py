@@ -6,7 +6,8 @@ them on disk.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from collections.abc import Callable
+from dataclasses import dataclass, fields, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,14 +18,17 @@ if TYPE_CHECKING:
     from ..oxford import RadarScan
     from .drive import Drive
     from .lidar_sensor import LidarSettings, Sweep
+    from .mapped import Cells
+    from .mesh import Mesh
     from .radar_sensor import RadarSettings
     from .scene import Scene
-    from .settings import VirtualSettings
+    from .settings import SessionSettings, VirtualSettings
     from .traffic import Traffic
     from .world import Town
 
 LIDARS = ("velodyne_left", "velodyne_right")
 FIRST_COUNT, COUNT_STEP = 13, 14  # encoder counts of the radar's rows: 13, 27, ... 5599 of 5600
+WORLD_RADIUS_M = 180.0  # how far from the drive a world grown from a map reaches
 # Parts of a session that draw from generators of their own.
 DRESS, DRIVE, TRAFFIC, SCANS, SWEEPS, ODOMETRY, GPS, INS, SCAN, SWEEP = range(10)
 
@@ -39,10 +43,12 @@ class VirtualSession:
         The settings of all sessions.
     name : str
         The session.
-    town : Town
-        The town.
+    town : Town or None
+        The town; None where the world is grown from a map.
+    ground : callable
+        Gives the height of the land at places, shape (n, 2) -> (n,) [m].
     scene : Scene
-        The town as this session finds it, without what moves.
+        The world as this session finds it, without what moves.
     drive : Drive
         Where the radar is at any time.
     traffic : Traffic
@@ -57,7 +63,8 @@ class VirtualSession:
 
     settings: VirtualSettings
     name: str
-    town: Town
+    town: Town | None
+    ground: Callable[[np.ndarray], np.ndarray]
     scene: Scene
     drive: Drive
     traffic: Traffic
@@ -81,7 +88,7 @@ class VirtualSession:
         """Give the town with everything that moves within a radius [m] where it is at one time [us]."""
         middle = self.drive.pose(np.array([stamp_us]))[0]
         return self.scene.with_moving(
-            self.traffic.meshes_at(self.town.plan, stamp_us, self.first_mover, middle, radius)
+            self.traffic.meshes_at(self.ground, stamp_us, self.first_mover, middle, radius)
         )
 
 
@@ -106,12 +113,8 @@ def build_session(settings: VirtualSettings, name: str) -> VirtualSession:
         If there is no such session.
     """
     from . import logs
-    from .drive import build_route, plan_drive
-    from .mesh import merge_meshes
     from .scene import Scene
     from .settings import describe
-    from .traffic import plan_traffic
-    from .world import dress
 
     describe(settings, name)  # a clear error if there is no such session
     own = settings.sessions[name]
@@ -119,16 +122,76 @@ def build_session(settings: VirtualSettings, name: str) -> VirtualSession:
     def rng(part: int, index: int = 0) -> np.random.Generator:
         return np.random.default_rng([settings.seed, own.seed, part, index])
 
+    given = load_route(settings, own) if settings.world == "route" else None
+    n_scans = own.scans if given is None else len(given)
+    scans, turns = logs.schedule_scans(own.first_stamp_us, n_scans, rng(SCANS))
+    if given is None:
+        town, ground, mesh, drive, traffic = _find_town(settings, own, scans, turns, rng)
+    else:
+        town, ground = None, _flat
+        mesh, drive, traffic = _find_route(settings, own, given, scans + turns // 2, rng)
+    span = int(scans[0]) - 100_000, int(scans[-1] + turns[-1]) + 100_000
+    sweeps = {sensor: logs.schedule_sweeps(*span, rng(SWEEPS, k)) for k, sensor in enumerate(LIDARS)}
+    kind = own.sweeps or settings.sweeps
+    chosen = {sensor: logs.choose_sweeps(us, scans, turns, kind) for sensor, us in sweeps.items()}
+    return VirtualSession(
+        settings, name, town, ground, Scene(mesh), drive, traffic, scans, turns, sweeps, chosen
+    )
+
+
+def load_route(settings: VirtualSettings, own: SessionSettings) -> np.ndarray:
+    """Read the real poses that a session of the route is driven along.
+
+    Parameters
+    ----------
+    settings : VirtualSettings
+        Where the real data lie.
+    own : SessionSettings
+        The number of the pose file, the first scan and how many.
+
+    Returns
+    -------
+    poses : array, shape (n, 3)
+        Poses at mid-scan in the frame of the map.
+
+    Raises
+    ------
+    SettingsError
+        If the real data are not there, or the file holds too few poses.
+    """
+    from .. import rall
+    from .settings import SettingsError
+
+    root = rall.find_real_root(settings.real_root)
+    if root is None:
+        raise SettingsError(
+            f"virtual: world: route: no real data in {settings.real_root or 'any of the usual places'}; "
+            "run `make real` or set ROL_REAL_ROOT"
+        )
+    path = root / rall.POSES_PATH / f"pose_xy_{own.poses}.txt"
+    poses = rall.load_poses(path)[own.first_scan :]
+    if len(poses) < max(own.scans, 3):
+        raise SettingsError(
+            f"{path}: {len(poses)} poses from scan {own.first_scan} on, {max(own.scans, 3)} are asked for"
+        )
+    return poses[: own.scans or None]
+
+
+def _find_town(
+    settings: VirtualSettings, own: SessionSettings, scans: np.ndarray, turns: np.ndarray, rng: Callable
+) -> tuple[Town, Callable[[np.ndarray], np.ndarray], Mesh, Drive, Traffic]:
+    """The town as one session finds it, and who is on the move."""
+    from .drive import build_route, plan_drive
+    from .mesh import merge_meshes
+    from .traffic import plan_traffic
+    from .world import dress
+
     town = _build_town(settings.seed, settings.loop_m, settings.relief_m)
     standing = dress(
-        town,
-        rng(DRESS),
-        parked_share=own.parked_share,
-        leaf_density=own.leaf_density,
+        town, rng(DRESS), parked_share=own.parked_share, leaf_density=own.leaf_density,
         changed_share=own.changed_share,
-    )
+    )  # fmt: skip
     route = build_route(town.plan)
-    scans, turns = logs.schedule_scans(own.first_stamp_us, own.scans, rng(SCANS))
     duration_s = float(scans[-1] + turns[-1] - scans[0]) * 1e-6
     drive = plan_drive(
         route, int(scans[0]), duration_s, rng(DRIVE),
@@ -137,14 +200,109 @@ def build_session(settings: VirtualSettings, name: str) -> VirtualSession:
     traffic = plan_traffic(
         town.plan, route, drive, rng(TRAFFIC), n_vehicles=own.vehicles, n_people=own.people
     )
-    span = int(scans[0]) - 100_000, int(scans[-1] + turns[-1]) + 100_000
-    sweeps = {sensor: logs.schedule_sweeps(*span, rng(SWEEPS, k)) for k, sensor in enumerate(LIDARS)}
-    chosen = {
-        sensor: logs.choose_sweeps(us, scans, turns) if settings.sweeps == "nearest" else np.arange(len(us))
-        for sensor, us in sweeps.items()
-    }
-    scene = Scene(merge_meshes([town.mesh, standing]))
-    return VirtualSession(settings, name, town, scene, drive, traffic, scans, turns, sweeps, chosen)
+    return town, town.plan.ground, merge_meshes([town.mesh, standing]), drive, traffic
+
+
+def _find_route(
+    settings: VirtualSettings, own: SessionSettings, poses: np.ndarray, middles_us: np.ndarray, rng: Callable
+) -> tuple[Mesh, Drive, Traffic]:
+    """The world of the map as one session finds it, and who is on the move."""
+    from .. import rall
+    from ..maps import thin_points
+    from . import mapped
+    from .mesh import merge_meshes
+    from .route import interpolate_drive, park_vehicles, plan_encounters
+
+    places = thin_points(poses[:, :2], 2.0)[0]
+    cells = _read_map(str(rall.find_real_root(settings.real_root) / rall.MAP_PATH))
+    cells = mapped.crop_cells(cells, places, WORLD_RADIUS_M)
+    unmapped = np.random.default_rng([settings.seed, 0, 98])  # the same on all days
+    left = mapped.change_cells(cells, rng(DRESS), missing_share=own.changed_share)
+    left = mapped.add_unmapped(left, poses[:, :2], unmapped, share=settings.unmapped_share)
+    drive = interpolate_drive(middles_us, poses)
+    things = [
+        mapped.build_ground(places, WORLD_RADIUS_M),
+        mapped.build_pieces(left, settings.seed, leaf_density=own.leaf_density),
+    ]
+    parked = park_vehicles(
+        drive, cells.points, rng(DRIVE), parked_share=own.parked_share,
+        first_object=int(left.groups.max(initial=0)) + 1,
+    )  # fmt: skip
+    traffic = plan_encounters(drive, rng(TRAFFIC), vehicles_per_min=own.vehicles, people_per_min=own.people)
+    return merge_meshes([*things, parked]), drive, traffic
+
+
+def build_twins(real_root: Path | str, seed: int = 1, margin_s: float = 30.0) -> VirtualSession:
+    """Prepare virtual twins of the real scans whose poses on the real map are known.
+
+    The world is that of the route; the car drives through the poses of the scans, before and after them it goes on
+    as it went.
+
+    Parameters
+    ----------
+    real_root : path
+        Folder of the real data.
+    seed : int
+        Draws what the map does not tell: heights, changes since, vehicles, noise.
+    margin_s : float
+        For how long the car drives before the first and after the last scan [s].
+
+    Returns
+    -------
+    session : VirtualSession
+        Ready for `make_scan`; the stamps are those of the real scans. It has no sweeps.
+
+    Raises
+    ------
+    rall.RallError
+        If a file of the real data is missing or at fault.
+    """
+    from .. import rall
+    from .scene import Scene
+    from .settings import SessionSettings, VirtualSettings
+
+    known = rall.load_scan_poses(Path(real_root) / rall.SCAN_POSES_PATH)
+    stamps, poses = np.array(list(known), dtype=np.int64), np.array(list(known.values()))
+    turns = np.full(len(stamps), 250_000, dtype=np.int64)
+    name = "virtual-twins"
+    own = SessionSettings(
+        "2019-01-10T14:37:26", len(stamps), seed, parked_share=0.15, vehicles=10, people=6, sweeps="none"
+    )
+    settings = VirtualSettings({name: own}, seed=seed, world="route", real_root=str(real_root))
+
+    def rng(part: int, index: int = 0) -> np.random.Generator:
+        return np.random.default_rng([settings.seed, own.seed, part, index])
+
+    before, after = np.arange(-margin_s, -0.1, 0.25), np.arange(0.25, margin_s, 0.25)
+    middles = stamps + turns // 2
+    mean_mps = np.hypot(*(poses[-1] - poses[0])[:2]) / ((middles[-1] - middles[0]) * 1e-6)
+    ends = [
+        np.column_stack([
+            pose[0] + mean_mps * seconds * np.cos(pose[2]), pose[1] + mean_mps * seconds * np.sin(pose[2]),
+            np.full(len(seconds), pose[2]),
+        ])
+        for pose, seconds in ((poses[0], before), (poses[-1], after))
+    ]  # fmt: skip
+    way = np.concatenate([ends[0], poses, ends[1]])
+    times = np.concatenate(
+        [middles[0] + (before * 1e6).astype(np.int64), middles, middles[-1] + (after * 1e6).astype(np.int64)]
+    )
+    mesh, drive, traffic = _find_route(settings, own, way, times, rng)
+    none: dict[str, np.ndarray] = {sensor: np.zeros(0, dtype=np.int64) for sensor in LIDARS}
+    return VirtualSession(settings, name, None, _flat, Scene(mesh), drive, traffic, stamps, turns, none, none)
+
+
+def _flat(places: np.ndarray) -> np.ndarray:
+    """Height of the land in a world grown from a map, which knows no heights."""
+    return np.zeros(len(places))
+
+
+@lru_cache(maxsize=1)
+def _read_map(path: str) -> Cells:
+    from .. import rall
+    from .mapped import classify_cells
+
+    return classify_cells(rall.load_map_points(path))
 
 
 @lru_cache(maxsize=1)
@@ -179,18 +337,19 @@ def make_scan(session: VirtualSession, index: int) -> RadarScan:
         session.generator(SCAN, index),
     )
     _, settings = sensor_settings(session.settings)
+    height = settings.height + float(session.ground(session.drive.pose(np.array([stamp]))[:, :2])[0])
     times = logs.scan_row_times(stamp, turn)
     middle = stamp + 0.5 * turn
-    moves = {
-        session.first_mover + i: tuple(v)
-        for i, v in enumerate(session.traffic.velocities_at(middle).tolist())
-    }
+    bodies, _, velocities = session.traffic.bodies_at(
+        middle, session.drive.pose(np.array([middle]))[0], 170.0
+    )
+    moves = {session.first_mover + int(i): tuple(v) for i, v in zip(bodies, velocities, strict=True)}
     codes = simulate_scan(
         session.scene_at(middle),
         session.drive.pose(times),
         session.drive.velocity(times),
         rng,
-        settings,
+        replace(settings, height=height),
         moves,
     )
     counters = (FIRST_COUNT + COUNT_STEP * np.arange(logs.N_ROWS)).astype(np.uint16)
@@ -224,7 +383,7 @@ def make_sweep(session: VirtualSession, sensor: str, index: int) -> Sweep:
         int(session.sweeps_us[sensor][index]), rng, first_angle=float(rng.uniform(0.0, 0.006))
     )
     poses = session.drive.pose(stamps)
-    height = session.settings.radar_height_m + session.town.plan.ground(poses[:1, :2])[0]
+    height = session.settings.radar_height_m + session.ground(poses[:1, :2])[0]
     T_radar_lidar = np.linalg.inv(EXTRINSICS["radar"]) @ EXTRINSICS[sensor]
     settings, _ = sensor_settings(session.settings)
     scene = session.scene_at(float(stamps[len(stamps) // 2]), settings.max_range_m + 10.0)

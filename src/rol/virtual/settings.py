@@ -9,6 +9,8 @@ from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
+SWEEPS = ("nearest", "all", "none")
+
 
 class SettingsError(ValueError):
     """A setting that does not exist or cannot be."""
@@ -39,7 +41,14 @@ class SessionSettings:
     changed_share : float
         Share of the street furniture changed and, times three, of the hedges cut, 0 .. 0.3.
     vehicles, people : int
-        Traffic.
+        Traffic: how many there are in the town, or how many come towards the car in a minute of the route.
+    sweeps : str
+        As in `VirtualSettings`, for this session; empty: as there.
+    poses : str
+        World "route" only: number of the pose file that is driven, such as "02". Speed, stops and the time of
+        standing are then the true ones.
+    first_scan : int
+        World "route" only: where in the pose file the session begins. With `scans` 0 it goes on to the end.
     """
 
     start: str
@@ -53,6 +62,9 @@ class SessionSettings:
     changed_share: float = 0.08
     vehicles: int = 16
     people: int = 14
+    sweeps: str = ""
+    poses: str = ""
+    first_scan: int = 0
 
     @property
     def first_stamp_us(self) -> int:
@@ -80,13 +92,20 @@ class VirtualSettings:
     radar_height_m : float
         Height of the radar above the ground [m].
     sweeps : str
-        "nearest": only the sweeps nearest to a scan's stamp and to its middle are made; "all": every one.
+        "nearest": only the sweeps nearest to a scan's stamp and to its middle are made; "all": every one;
+        "none".
     labels_every : int
         Of every so manieth sweep the true materials are written as well; 0 for none.
     odometry_scale : float
         Spread of the forward scale error of gt/radar_odometry.csv, drawn once per session.
     odometry_yaw_rad : float
         Spread of its heading error per scan [rad].
+    world : str
+        "town": a town drawn from the seed; "route": the world of the real lidar map, driven along real poses.
+    real_root : str
+        World "route" only: folder of the real data; empty: the usual places, see `rall.find_real_root`.
+    unmapped_share : float
+        World "route" only: things that the map does not show, as a share of the groups of cells that it shows.
     lidar, radar : dict
         Settings of `LidarSettings` and `RadarSettings` other than the usual ones.
     """
@@ -101,6 +120,9 @@ class VirtualSettings:
     labels_every: int = 20
     odometry_scale: float = 0.0015
     odometry_yaw_rad: float = 2.0e-4
+    world: str = "town"
+    real_root: str = ""
+    unmapped_share: float = 1.2
     lidar: dict[str, Any] = field(default_factory=dict)
     radar: dict[str, Any] = field(default_factory=dict)
 
@@ -135,21 +157,23 @@ def parse_settings(section: Mapping[str, Any], where: str = "virtual") -> Virtua
         if "start" not in values:
             raise SettingsError(f"{place}: the key 'start' is missing")
         sessions[str(name)] = _check_session(
-            SessionSettings(**_check_types(SessionSettings, values, place)), place
+            SessionSettings(**_check_types(SessionSettings, values, place)), place, str(section.get("world"))
         )
     settings = VirtualSettings(sessions, **_check_types(VirtualSettings, section, where))
     _check_ranges(
         settings,
         where,
         positive=("loop_m", "radar_height_m"),
-        not_negative=("seed", "relief_m", "labels_every"),
+        not_negative=("seed", "relief_m", "labels_every", "unmapped_share"),
     )
     if settings.loop_m < 450.0:
         raise SettingsError(
             f"{where}: loop_m: {settings.loop_m} is too short for streets with houses, 450 at least"
         )
-    if settings.sweeps not in ("nearest", "all"):
-        raise SettingsError(f"{where}: sweeps: {settings.sweeps!r} is neither 'nearest' nor 'all'")
+    if settings.sweeps not in SWEEPS:
+        raise SettingsError(f"{where}: sweeps: {settings.sweeps!r} is none of {', '.join(SWEEPS)}")
+    if settings.world not in ("town", "route"):
+        raise SettingsError(f"{where}: world: {settings.world!r} is neither 'town' nor 'route'")
     return settings
 
 
@@ -235,7 +259,7 @@ def describe(settings: VirtualSettings, name: str) -> dict[str, Any]:
             f"no session {name!r} in the settings; there are: {', '.join(settings.sessions) or 'none'}"
         )
     values = asdict(settings)
-    del values["sessions"]
+    del values["sessions"], values["real_root"]  # where the real data lie changes nothing in a session
     return {**values, "session": asdict(settings.sessions[name])}
 
 
@@ -267,7 +291,7 @@ def _check_types(kind: type, values: Mapping[str, Any], where: str) -> dict[str,
     return checked
 
 
-def _check_session(session: SessionSettings, where: str) -> SessionSettings:
+def _check_session(session: SessionSettings, where: str, world: str) -> SessionSettings:
     try:
         session.first_stamp_us  # noqa: B018 (only to see whether it can be read)
     except ValueError as error:
@@ -276,9 +300,16 @@ def _check_session(session: SessionSettings, where: str) -> SessionSettings:
         session, where, positive=("cruise_mps",),
         not_negative=(
             "seed", "stops", "stand_s", "parked_share", "leaf_density", "changed_share", "vehicles", "people",
+            "scans", "first_scan",
         ),
     )  # fmt: skip
-    if session.scans < 3:
+    if session.sweeps and session.sweeps not in SWEEPS:
+        raise SettingsError(f"{where}: sweeps: {session.sweeps!r} is none of {', '.join(SWEEPS)}")
+    if world == "route" and not session.poses:
+        raise SettingsError(
+            f"{where}: the key 'poses' is missing, the number of a pose file of the real route"
+        )
+    if session.scans < 3 and not (world == "route" and session.scans == 0):
         raise SettingsError(
             f"{where}: scans: {session.scans} is too few, 3 are needed for one step of odometry"
         )

@@ -11,11 +11,17 @@ from itertools import pairwise
 
 import numpy as np
 
+try:
+    from ..geometry import relative_pose
+except ImportError:  # this file was copied on its own
+    from geometry import relative_pose
+
 BRIGHTNESS_CODES = (40, 60, 80, 100, 120)
 ZERO_RANGES_M = (3.0, 28.0, 41.0, 80.0, 106.0, 145.0)
 NEAR_RANGES_M = (0.0, 0.86, 2.0, 3.0)
 PEAK_EDGES = (0, 110, 130, 133, 256)
 MEASURED_RANGE_RESOLUTION = 0.0438  # bins are named by bin * resolution here, as the measured figures are
+BEAM_AZIMUTHS = -2.0 * np.pi * (13 + 14 * np.arange(400)) / 5600
 QUIET_CODE = 30  # a piece of a row whose codes stay below this holds noise and little else
 FAR_BIN = 3000
 
@@ -51,6 +57,39 @@ def brightness_shares(codes: np.ndarray, codes_from: tuple[int, ...] = BRIGHTNES
     counts = np.bincount(np.asarray(codes).ravel(), minlength=256)
     tail = counts[::-1].cumsum()[::-1] / counts.sum()
     return {code: float(tail[code]) for code in codes_from}
+
+
+def code_histogram(codes: np.ndarray) -> np.ndarray:
+    """Give the share of pixels of every code.
+
+    Parameters
+    ----------
+    codes : array, shape (..., 400, 3768), uint8
+        Scans.
+
+    Returns
+    -------
+    shares : array, shape (256,)
+        They sum to one.
+    """
+    counts = np.bincount(np.asarray(codes).ravel(), minlength=256)
+    return counts / counts.sum()
+
+
+def hellinger_distance(p: np.ndarray, q: np.ndarray) -> float:
+    """Give the distance of two histograms: 0 for equal ones, 1 for those without a common code.
+
+    Parameters
+    ----------
+    p, q : array, shape (n,)
+        Histograms that sum to one.
+
+    Returns
+    -------
+    distance : float
+        Root of one minus the sum of sqrt(p q).
+    """
+    return float(np.sqrt(max(0.0, 1.0 - np.sum(np.sqrt(np.asarray(p) * np.asarray(q))))))
 
 
 def zero_shares(codes: np.ndarray, ranges_m: tuple[float, ...] = ZERO_RANGES_M, half_bins: int = 15) -> dict:
@@ -205,6 +244,85 @@ def point_spread(codes: np.ndarray, reach: tuple[int, int] = (5, 16)) -> dict[st
     return {"azimuth_db": _fold(azimuth), "range_db": _fold(range_)}
 
 
+def motion_statistics(
+    codes: np.ndarray,
+    poses: np.ndarray,
+    *,
+    lag: int = 5,
+    scan_seconds: float = 0.25,
+    doppler_seconds: tuple[float, ...] = tuple(np.arange(-0.06, 0.1501, 0.01)),
+) -> dict:
+    """Measure what the car's motion does to scans: the turn is a spiral, and what comes nearer reads nearer.
+
+    Scans from places some metres apart are laid on each other by their known poses. What stood ahead of the one
+    stands abeam of the other, so a wrong range ahead shows; how well they agree says which correction is right.
+
+    Parameters
+    ----------
+    codes : array, shape (n, 400, 3768), uint8
+        Successive scans, all of them from a moving car; more than ``lag``.
+    poses : array, shape (n, 3)
+        Poses at mid-scan in any frame (x, y, yaw) [m, m, rad].
+    lag : int
+        Scan i is compared with scan i + lag.
+    scan_seconds : float
+        Time of a turn [s].
+    doppler_seconds : tuple of float
+        Doppler range shifts per closing speed to be tried [s].
+
+    Returns
+    -------
+    statistics : dict
+        "metres_per_turn": mean way; "correlation_raw", "correlation_motion", "correlation_both": mean
+        correlation of the Cartesian images of such pairs, uncorrected, with the motion during the turn taken
+        out, and with the best Doppler shift as well; "doppler_seconds": that shift [s], positive where what is
+        ahead reads nearer; "doppler_curve": correlation of every shift tried.
+    """
+    steps, ways = relative_pose(poses[:-1], poses[1:]), relative_pose(poses[:-lag], poses[lag:])
+    twists = np.vstack([steps, steps[-1:]]) / scan_seconds
+    curve = {float(shift): _mean_correlation(codes, ways, lag, twists, shift) for shift in doppler_seconds}
+    best = max(curve, key=curve.__getitem__)
+    return {
+        "metres_per_turn": float(np.hypot(steps[:, 0], steps[:, 1]).mean()),
+        "correlation_raw": _mean_correlation(codes, ways, lag, None, 0.0),
+        "correlation_motion": _mean_correlation(codes, ways, lag, twists, 0.0),
+        "correlation_both": curve[best],
+        "doppler_seconds": best,
+        "doppler_curve": curve,
+    }
+
+
+def _mean_correlation(
+    codes: np.ndarray, ways: np.ndarray, lag: int, twists: np.ndarray | None, doppler_seconds: float
+) -> float:
+    """Mean correlation of scans i and i + lag, as images of 0.25 m per pixel laid on each other."""
+    import cv2
+
+    from ..radar import MEASURED_RANGE_OFFSET, polar_to_cartesian
+
+    width, pixel, found = 512, 0.25, []
+    middle = (width - 1) / 2.0
+    images = [
+        polar_to_cartesian(
+            scan, BEAM_AZIMUTHS, range_resolution=MEASURED_RANGE_RESOLUTION, range_offset=MEASURED_RANGE_OFFSET,
+            pixel_size=pixel, width=width, twist=None if twists is None else twists[i],
+            doppler_seconds=doppler_seconds,
+        )
+        for i, scan in enumerate(codes)
+    ]  # fmt: skip
+    away = np.hypot(*(np.mgrid[:width, :width] - middle)) * pixel
+    own = np.where((away > 4.0) & (away < 50.0), np.float32(0.0), np.float32(np.nan))  # no leakage
+    for before, after, (x, y, yaw) in zip(images[:-lag], images[lag:], ways, strict=True):
+        # Column c and row r show the place (middle - r, middle - c) * pixel; both axes fall, so a turn stays one.
+        c, s = np.cos(yaw), np.sin(yaw)
+        forward = np.array([[c, s, 0.0], [-s, c, 0.0]])
+        forward[:, 2] = np.array([-y, -x]) / pixel + middle - forward[:, :2] @ (middle, middle)
+        moved = cv2.warpAffine(after + own, forward, (width, width), borderValue=np.nan)
+        seen = np.isfinite(moved + own)
+        found.append(np.corrcoef(before[seen], moved[seen])[0, 1])
+    return float(np.mean(found))
+
+
 def scan_statistics(codes: np.ndarray) -> dict:
     """Measure all that one scan, or a few, can tell about its sensor.
 
@@ -216,7 +334,7 @@ def scan_statistics(codes: np.ndarray) -> dict:
     Returns
     -------
     statistics : dict
-        "shares": code -> share of pixels at or above it; "zero_shares": range [m] -> share of code 0 in quiet
+        "histogram": share of every code; "shares": code -> share of pixels at or above it; "zero_shares": range [m] -> share of code 0 in quiet
         cells; "range_correlation": of the noise at lags 1-7 bins; "azimuth_correlation"; "near_field": range
         [m] -> mean code; "near_copies": True when bins 0-4 are identical; "floors": class of peak -> far
         floor; "point_spread": levels [dB] by distance; "forbidden": number of pixels with a code that cannot
@@ -232,6 +350,7 @@ def scan_statistics(codes: np.ndarray) -> dict:
         raise ValueError(f"codes: expected uint8 of shape (..., 400, 3768), got {codes.dtype} {codes.shape}")
     near = _rows(codes)[:, :5]
     return {
+        "histogram": code_histogram(codes),
         "shares": brightness_shares(codes),
         "shares_40_by_range": shares_by_range(codes, 40),
         "zero_shares": zero_shares(codes),
@@ -269,6 +388,53 @@ def shares_by_range(
     names = [f"{low:g}-{high:g}" for low, high in pairwise(edges_m)]
     shares = [float((scans[:, low:high] >= code).mean()) for low, high in pairwise(bins)]
     return dict(zip(names, shares, strict=True))
+
+
+def map_shares(
+    codes: np.ndarray,
+    poses: np.ndarray,
+    map_points: np.ndarray,
+    within_m: tuple[float, ...] = (1.0, 2.0),
+    *,
+    k: int = 12,
+    min_code: int = 70,
+    max_range_m: float = 64.0,
+) -> np.ndarray:
+    """Give the share of raw radar peaks that lie near a map point, scan by scan.
+
+    Parameters
+    ----------
+    codes : array, shape (n, 400, 3768), uint8
+        Scans.
+    poses : array, shape (n, 3)
+        Their poses in the map (x, y, yaw) [m, m, rad].
+    map_points : array, shape (m, 2)
+        Points of the map [m].
+    within_m : tuple of float
+        Distances [m].
+    k, min_code, max_range_m : int, int, float
+        The detector: strongest peaks per azimuth, weakest code, farthest range [m]; no network, no correction
+        of motion.
+
+    Returns
+    -------
+    shares : array, shape (n, len(within_m))
+        Share of the peaks of each scan; NaN for a scan without peaks.
+    """
+    from scipy.spatial import cKDTree
+
+    from ..geometry import transform_points
+    from ..radar import MEASURED_RANGE_OFFSET, k_strongest_peaks
+
+    tree, shares = cKDTree(map_points), []
+    for scan, pose in zip(codes, poses, strict=True):
+        peaks = k_strongest_peaks(
+            scan, BEAM_AZIMUTHS, k, min_code, max_range_m=max_range_m,
+            range_resolution=MEASURED_RANGE_RESOLUTION, range_offset=MEASURED_RANGE_OFFSET,
+        )  # fmt: skip
+        gaps = tree.query(transform_points(pose, peaks))[0]
+        shares.append([float(np.mean(gaps < limit)) if len(gaps) else float("nan") for limit in within_m])
+    return np.array(shares)
 
 
 def _rows(codes: np.ndarray) -> np.ndarray:

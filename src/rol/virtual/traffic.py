@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -21,47 +22,79 @@ if TYPE_CHECKING:
     from .streets import StreetPlan
 
 STEP_US = 50_000  # traffic is kept at 20 Hz
+EDGE = 3.0  # a body stays that many steps before its first and after its last pose
 
 
 @dataclass(frozen=True)
 class Traffic:
-    """Bodies on the move.
+    """Bodies on the move, each of them there for a while.
 
     Attributes
     ----------
     meshes : tuple of Mesh
         The bodies, each in its own frame.
-    first_stamp_us : int
-        Time of the first poses; the others follow every 50 ms [us].
-    poses : array, shape (m, n, 3)
-        Poses of the m bodies in the town (x, y, yaw), yaw running on without wrapping.
+    first_stamps_us : array, shape (m,), int64
+        Time of each body's first pose; the others follow every 50 ms [us].
+    tracks : tuple of array, shape (n_i, 3)
+        Poses of each body in the world (x, y, yaw), yaw running on without wrapping; at least two. Before the
+        first and after the last the body is not there.
     """
 
     meshes: tuple[Mesh, ...]
-    first_stamp_us: int
-    poses: np.ndarray
+    first_stamps_us: np.ndarray
+    tracks: tuple[np.ndarray, ...]
 
-    def poses_at(self, stamp_us: float) -> np.ndarray:
-        """Give the poses of all bodies at one time [us], shape (m, 3); outside the session they stand."""
-        last = self.poses.shape[1] - 1
-        u = min(max((stamp_us - self.first_stamp_us) / STEP_US, 0.0), float(last))
-        i = min(int(u), last - 1)
-        return self.poses[:, i] + (u - i) * (self.poses[:, i + 1] - self.poses[:, i])
+    def bodies_at(
+        self, stamp_us: float, middle: np.ndarray, radius: float = np.inf
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Find who is near a place at one time.
 
-    def velocities_at(self, stamp_us: float) -> np.ndarray:
-        """Give the velocities of all bodies in the town at one time [us], shape (m, 2) [m/s]."""
-        step = self.poses_at(stamp_us + 0.5 * STEP_US) - self.poses_at(stamp_us - 0.5 * STEP_US)
-        return step[:, :2] / (STEP_US * 1e-6)
+        Parameters
+        ----------
+        stamp_us : float
+            Time [us].
+        middle : array, shape (2,) or more
+            The place [m].
+        radius : float
+            Bodies farther away are left out [m].
+
+        Returns
+        -------
+        numbers : array of int, shape (k,)
+            Which bodies.
+        poses : array, shape (k, 3)
+            Where they are (x, y, yaw).
+        velocities : array, shape (k, 2)
+            Velocity of each in the world [m/s].
+        """
+        u = (stamp_us - self.first_stamps_us) / STEP_US
+        last = np.array([len(track) - 1 for track in self.tracks], dtype=np.int64)
+        found = []
+        for i in np.flatnonzero((u >= -EDGE) & (u <= last + EDGE)):
+            k = min(max(int(u[i]), 0), last[i] - 1)
+            step = self.tracks[i][k + 1] - self.tracks[i][k]
+            pose = self.tracks[i][k] + min(max(u[i] - k, 0.0), 1.0) * step
+            if np.hypot(*(pose[:2] - np.asarray(middle)[:2])) < radius:
+                found.append((i, pose, step[:2] / (STEP_US * 1e-6)))
+        numbers, poses, velocities = zip(*found, strict=True) if found else ((), (), ())
+        shapes = (-1,), (-1, 3), (-1, 2)
+        values = np.array(numbers, dtype=np.int64), np.array(poses), np.array(velocities)
+        return tuple(value.reshape(shape) for value, shape in zip(values, shapes, strict=True))
 
     def meshes_at(
-        self, plan: StreetPlan, stamp_us: float, first_object: int, middle: np.ndarray, radius: float = 170.0
+        self,
+        ground: Callable[[np.ndarray], np.ndarray],
+        stamp_us: float,
+        first_object: int,
+        middle: np.ndarray,
+        radius: float = 170.0,
     ) -> Mesh:
         """Set the bodies near a place down where they are at one time.
 
         Parameters
         ----------
-        plan : StreetPlan
-            For the height of the land.
+        ground : callable
+            Gives the height of the land at places, shape (n, 2) -> (n,) [m].
         stamp_us : float
             Time [us].
         first_object : int
@@ -78,15 +111,12 @@ class Traffic:
         """
         from .mesh import merge_meshes, move_mesh
 
-        poses = self.poses_at(stamp_us)
-        near = np.flatnonzero(np.hypot(*(poses[:, :2] - middle[:2]).T) < radius)
-        z = plan.ground(poses[near, :2])
-        return merge_meshes(
-            [
-                move_mesh(self.meshes[i], poses[i], h, first_object + int(i))
-                for i, h in zip(near, z, strict=True)
-            ]
-        )
+        numbers, poses, _ = self.bodies_at(stamp_us, middle, radius)
+        heights = ground(poses[:, :2])
+        return merge_meshes([
+            move_mesh(self.meshes[i], pose, h, first_object + int(i))
+            for i, pose, h in zip(numbers, poses, heights, strict=True)
+        ])  # fmt: skip
 
 
 def plan_traffic(
@@ -135,8 +165,8 @@ def plan_traffic(
         movers.append((_draw_vehicle(rng), _unwrapped(poses, np.pi if inward else 0.0)))
     for _ in range(n_people):
         movers.append(_on_foot(plan, seconds, rng))
-    poses = np.array([track for _, track in movers]).reshape(len(movers), len(stamps), 3)
-    return Traffic(tuple(mesh for mesh, _ in movers), int(stamps[0]), poses)
+    begin = np.full(len(movers), stamps[0], dtype=np.int64)
+    return Traffic(tuple(mesh for mesh, _ in movers), begin, tuple(track for _, track in movers))
 
 
 def _draw_vehicle(rng: np.random.Generator) -> Mesh:

@@ -7,11 +7,16 @@ at hand; `session.json` is written last and tells that the session is complete.
 
 from __future__ import annotations
 
+import errno
 import json
+import multiprocessing
 import os
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from itertools import pairwise
 from pathlib import Path
+from time import perf_counter
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -20,7 +25,8 @@ if TYPE_CHECKING:
     from .session import VirtualSession
     from .settings import VirtualSettings
 
-FORMAT = 1  # raise it when the same settings give other files
+SCAN_BYTES, SWEEP_BYTES = 470_000, 65_000  # what a file takes on the mean
+FORMAT = 2  # raise it when the same settings give other files
 LIDARS = ("velodyne_left", "velodyne_right")
 _MADE = (
     "session.json",
@@ -36,7 +42,12 @@ _MADE = (
 
 
 def write_session(
-    settings: VirtualSettings, name: str, root: Path | str, report: Callable[[str], None] = lambda line: None
+    settings: VirtualSettings,
+    name: str,
+    root: Path | str,
+    report: Callable[[str], None] = lambda line: None,
+    *,
+    jobs: int = 1,
 ) -> Path:
     """Write a session folder, or go on with one that was interrupted.
 
@@ -49,7 +60,9 @@ def write_session(
     root : path
         Folder of the sessions.
     report : callable
-        Takes a line of text at the beginning, every tenth of the way and at the end.
+        Takes a line of text: what will be written and how large it is, how far it has come, the end.
+    jobs : int
+        Processes that write at once. The files are the same whatever their number.
 
     Returns
     -------
@@ -62,6 +75,8 @@ def write_session(
         If there is no such session, or a sensor's setting does not exist.
     ValueError
         If the folder holds files that were not made by this program.
+    OSError
+        If the disk has not the room that the session needs, or is full.
     """
     from .session import build_session, sensor_settings
     from .settings import describe
@@ -71,19 +86,102 @@ def write_session(
     if not _prepare_folder(folder, {"format": FORMAT, **describe(settings, name)}, report):
         return folder
     session = build_session(settings, name)
+    report(f"{name}: {check_room(folder, session)}")
     n = len(session.scans_us)
-    pending = {sensor: list(enumerate(session.chosen[sensor])) for sensor in LIDARS}
-    for i in range(n):
-        end = session.scans_us[i] + session.turns_us[i] if i < n - 1 else np.iinfo(np.int64).max
-        _write_scan(folder, session, i)
-        for sensor in LIDARS:
-            while pending[sensor] and session.sweeps_us[sensor][pending[sensor][0][1]] < end:
-                _write_sweep(folder, session, sensor, *pending[sensor].pop(0))
-        if (i + 1) * 10 // n > i * 10 // n:
-            report(f"{name}: {i + 1} of {n} scans")
+    edges = np.unique(np.linspace(0, n, min(n, max(20, n // 50)) + 1).astype(int)).tolist()
+    begin = perf_counter()
+    for done in _write_stretches(folder, session, list(pairwise(edges)), jobs):
+        rate = done / max(perf_counter() - begin, 1e-9)
+        left = f", {rate:.1f} a second, {(n - done) / rate:.0f} s left" if done < n else ""
+        report(f"{name}: {done} of {n} scans{left}")
     _write_logs(folder, session)
     report(f"{name}: complete")
     return folder
+
+
+def check_room(folder: Path, session: VirtualSession) -> str:
+    """Say how much will be written, and refuse if the disk has not the room.
+
+    Parameters
+    ----------
+    folder : Path
+        The session's folder, which exists; what is there already is not counted again.
+    session : VirtualSession
+        The session.
+
+    Returns
+    -------
+    line : str
+        Numbers of scans and sweeps, size, free room.
+
+    Raises
+    ------
+    OSError
+        If less is free than is needed.
+    """
+    sweeps = sum(len(session.chosen[sensor]) for sensor in LIDARS)
+    whole = len(session.scans_us) * SCAN_BYTES + sweeps * SWEEP_BYTES
+    there = sum(path.stat().st_size for part in ("radar", *LIDARS) for path in (folder / part).glob("*"))
+    needed, free = max(whole - there, 0), shutil.disk_usage(folder).free
+    line = (
+        f"{len(session.scans_us)} scans and {sweeps} sweeps, about {whole / 1e9:.2f} GB in all, "
+        f"{needed / 1e9:.2f} GB of them to be written; {free / 1e9:.1f} GB are free"
+    )
+    if free < needed:
+        raise OSError(errno.ENOSPC, f"not enough room: {line}", str(folder))
+    return line
+
+
+def _write_stretches(
+    folder: Path, session: VirtualSession, stretches: list[tuple[int, int]], jobs: int
+) -> Iterator[int]:
+    """Write all scans and sweeps; gives how many scans are there after each stretch."""
+    done = 0
+    if jobs <= 1:
+        for first, end in stretches:
+            _write_stretch(folder, session, first, end)
+            yield end
+        return
+    context = multiprocessing.get_context("spawn")  # a fork would inherit the ray caster's locks
+    given = (folder, session.settings, session.name)
+    with ProcessPoolExecutor(jobs, context, initializer=_open_worker, initargs=given) as pool:
+        waiting = {pool.submit(_work, *stretch): stretch for stretch in stretches}
+        try:
+            for finished in as_completed(waiting):
+                finished.result()
+                done += waiting[finished][1] - waiting[finished][0]
+                yield done
+        finally:
+            pool.shutdown(wait=False, cancel_futures=True)
+
+
+_worker: tuple[Path, VirtualSession] | None = None
+
+
+def _open_worker(folder: Path, settings: VirtualSettings, name: str) -> None:
+    """Build the session once in each process."""
+    from .session import build_session
+
+    global _worker
+    _worker = folder, build_session(settings, name)
+
+
+def _work(first: int, end: int) -> None:
+    assert _worker is not None
+    _write_stretch(*_worker, first, end)
+
+
+def _write_stretch(folder: Path, session: VirtualSession, first: int, end: int) -> None:
+    """Write some scans and the sweeps that begin during them, or before the first and after the last one."""
+    n = len(session.scans_us)
+    low = session.scans_us[first] if first > 0 else np.iinfo(np.int64).min
+    high = session.scans_us[end] if end < n else np.iinfo(np.int64).max
+    for index in range(first, end):
+        _write_scan(folder, session, index)
+    for sensor in LIDARS:
+        begins = session.sweeps_us[sensor][session.chosen[sensor]]
+        for place in np.flatnonzero((begins >= low) & (begins < high)):
+            _write_sweep(folder, session, sensor, int(place), int(session.chosen[sensor][place]))
 
 
 def _prepare_folder(folder: Path, wanted: dict[str, Any], report: Callable[[str], None]) -> bool:
@@ -115,7 +213,7 @@ def _prepare_folder(folder: Path, wanted: dict[str, Any], report: Callable[[str]
             else:
                 entry.unlink(missing_ok=True)
     _write_json(path, wanted)
-    for name in ("radar", *LIDARS, "gt", "gps"):
+    for name in ("radar", "gt", "gps"):
         (folder / name).mkdir(exist_ok=True)
     return True
 
@@ -133,6 +231,7 @@ def _write_sweep(folder: Path, session: VirtualSession, sensor: str, place: int,
     from ..oxford import VelodyneRaw, save_velodyne_raw
     from .session import make_sweep
 
+    (folder / sensor).mkdir(exist_ok=True)
     stamp, every = int(session.sweeps_us[sensor][index]), session.settings.labels_every
     path = folder / sensor / f"{stamp}.png"
     labels = folder / "labels" / sensor / path.name if every and place % every == 0 else None
@@ -154,9 +253,11 @@ def _write_logs(folder: Path, session: VirtualSession) -> None:
     scans, middles, settings = session.scans_us, session.scans_us + session.turns_us // 2, session.settings
     oxford.save_timestamps(folder / "radar.timestamps", scans)
     for sensor in LIDARS:
-        oxford.save_timestamps(
-            folder / f"{sensor}.timestamps", session.sweeps_us[sensor][session.chosen[sensor]]
-        )
+        if len(
+            session.chosen[sensor]
+        ):  # a session without sweeps looks like one whose lidars were not fetched
+            chosen = session.sweeps_us[sensor][session.chosen[sensor]]
+            oxford.save_timestamps(folder / f"{sensor}.timestamps", chosen)
     truth = session.drive.pose(middles)
     steps = np.zeros((len(scans) - 2, 6))  # as in the data set, the last scan has no pose
     steps[:, [0, 1, 5]] = logs.drift_odometry(
@@ -192,8 +293,8 @@ def _summarise(session: VirtualSession, truth: np.ndarray) -> dict[str, Any]:
         "distance_m": round(float(way[1] - way[0]), 2),
         "n_scans": len(session.scans_us),
         "n_sweeps": {sensor: len(session.chosen[sensor]) for sensor in LIDARS},
-        "start_pose_town": [round(float(v), 6) for v in truth[0]],
-        "truth": "truth.tum: pose of the radar in the town at mid-scan, under the scan's own stamp",
+        "start_pose_world": [round(float(v), 6) for v in truth[0]],
+        "truth": "truth.tum: pose of the radar in the world at mid-scan, under the scan's own stamp",
     }
 
 

@@ -1,0 +1,172 @@
+"""The small pieces of real data: the lidar map, true poses and radar odometry of the paper's sessions.
+
+They were published by the paper's first author with a later work (Yin et al., "RaLL", T-ITS 2021). The files
+lie under a folder that is called `real_root` everywhere, in the layout of the public repositories, see
+`data/README.md`. All poses are (x, y, yaw) in the frame of the map [m, m, rad], y left, yaw counter-clockwise.
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+
+MAP_PATH = Path("RaLL/data/maps/RobotCar/png/oxford_laser_map.png")
+POSES_PATH = Path("RaLL/data/gt_poses/RobotCar")
+ODOMETRY_PATH = Path("RaLL/data/odom/RobotCar")
+SCANS_PATH = Path("RadarSLAMPy/data/tiny")
+SCAN_POSES_PATH = Path("oxford_scan_map_poses.csv")
+MAP_CELL = 0.25  # side of a pixel of the map [m]
+MAP_CORNER = (
+    1500.0,
+    800.0,
+)  # x at the upper edge of the first row, y at the left edge of the first column [m]
+
+
+class RallError(ValueError):
+    """Raised for a file of the real data that is missing or not what it should be; names file and fault."""
+
+
+def find_real_root(given: str | Path = "") -> Path | None:
+    """Find the folder of the real data.
+
+    Parameters
+    ----------
+    given : path
+        Where to look; if empty, the environment variable ROL_REAL_ROOT, `data/real` and `../shared/real` are
+        tried in this order.
+
+    Returns
+    -------
+    root : Path or None
+        The first of these folders that holds the lidar map, or None.
+    """
+    places = [given] if given else [os.environ.get("ROL_REAL_ROOT"), "data/real", "../shared/real"]
+    for place in places:
+        if place and (Path(place) / MAP_PATH).is_file():
+            return Path(place)
+    return None
+
+
+def load_map_points(path: Path | str) -> np.ndarray:
+    """Read the lidar map, a picture of occupied cells.
+
+    Parameters
+    ----------
+    path : path
+        PNG of 0.25 m per pixel, zero for free; x points up and y to the left.
+
+    Returns
+    -------
+    points : array, shape (n, 2)
+        Middles of the occupied cells in the map frame [m].
+
+    Raises
+    ------
+    RallError
+        If the file is missing, no grey picture, or empty.
+    """
+    import cv2
+
+    path = Path(path)
+    image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED) if path.is_file() else None
+    if image is None:
+        raise RallError(f"{path}: missing or not a picture")
+    if image.ndim != 2:
+        raise RallError(f"{path}: expected one grey channel, got shape {image.shape}")
+    rows, columns = np.nonzero(image)
+    if len(rows) == 0:
+        raise RallError(f"{path}: the map holds no occupied cell")
+    return np.column_stack([
+        MAP_CORNER[0] - MAP_CELL * (rows + 0.5), MAP_CORNER[1] - MAP_CELL * (columns + 0.5)
+    ])  # fmt: skip
+
+
+def load_poses(path: Path | str) -> np.ndarray:
+    """Read the true poses of a session in the frame of the map.
+
+    Parameters
+    ----------
+    path : path
+        `pose_xy_NN.txt`: x, y, yaw, one row per radar scan.
+
+    Returns
+    -------
+    poses : array, shape (n, 3)
+        Poses of the radar at mid-scan [m, m, rad].
+
+    Raises
+    ------
+    RallError
+        If the file is missing, or a row does not hold three finite numbers.
+    """
+    return _load_rows(path)
+
+
+def load_odometry(path: Path | str) -> np.ndarray:
+    """Read the authors' own radar odometry, ICP between generated clouds.
+
+    Parameters
+    ----------
+    path : path
+        `seqNN_odom.txt`: dx, dy, dyaw in the body frame; row i moves scan i to scan i + 1.
+
+    Returns
+    -------
+    steps : array, shape (n, 3)
+        Steps [m, m, rad]. Files 01 and 02 hold one row more than there are steps.
+
+    Raises
+    ------
+    RallError
+        If the file is missing, or a row does not hold three finite numbers.
+    """
+    return _load_rows(path)
+
+
+def load_scan_poses(path: Path | str) -> dict[int, np.ndarray]:
+    """Read the map poses of single radar scans.
+
+    Parameters
+    ----------
+    path : path
+        `oxford_scan_map_poses.csv`: timestamp_us, x_m, y_m, yaw_rad under a line of names.
+
+    Returns
+    -------
+    poses : dict
+        Time of the scan's first row [us] -> pose at mid-scan, shape (3,).
+
+    Raises
+    ------
+    RallError
+        If the file is missing or a row is at fault.
+    """
+    path, poses = Path(path), {}
+    if not path.is_file():
+        raise RallError(f"{path}: missing")
+    for number, line in enumerate(path.read_text(encoding="utf-8").splitlines()[1:], start=2):
+        words = line.split(",")
+        try:
+            poses[int(words[0])] = np.array([float(word) for word in words[1:4]])
+        except ValueError as error:
+            raise RallError(f"{path}: line {number}: {error}") from error
+        if len(words) != 4 or not np.isfinite(poses[int(words[0])]).all():
+            raise RallError(f"{path}: line {number}: expected timestamp_us,x_m,y_m,yaw_rad, all finite")
+    return poses
+
+
+def _load_rows(path: Path | str) -> np.ndarray:
+    path = Path(path)
+    if not path.is_file():
+        raise RallError(f"{path}: missing")
+    try:
+        rows = np.loadtxt(path, ndmin=2)
+    except ValueError as error:
+        raise RallError(f"{path}: not a table of numbers: {error}") from error
+    if rows.ndim != 2 or rows.shape[1:] != (3,) or len(rows) == 0:
+        raise RallError(f"{path}: expected rows of three numbers, got shape {rows.shape}")
+    if not np.isfinite(rows).all():
+        raise RallError(f"{path}: row {int(np.argwhere(~np.isfinite(rows))[0, 0]) + 1} is not finite")
+    return rows

@@ -1,0 +1,409 @@
+"""A world grown from a flat lidar map: each occupied cell becomes an upright piece of something.
+
+A map tells where things stand, not how high they are nor what they are made of. Both are guessed from the
+neighbourhood: long and straight is a wall or a house front, scattered is vegetation, small and lonely is a
+pole or a vehicle. A session then finds the world as the world differs from a map of last week. World frame:
+that of the map, z up from the road [m].
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numba import njit
+from scipy.spatial import cKDTree
+
+if TYPE_CHECKING:
+    from .mesh import Mesh
+
+LINK_M = 0.8  # cells nearer than this belong together ...
+ROW_LINK_M, ROW_BEND = (
+    1.6,
+    np.deg2rad(25.0),
+)  # ... in a straight row also across gaps, if it goes on so straight
+REACH_M, STRIP_M = 3.0, 0.3  # length and half width of the strips in which rows are looked for, to each side
+N_WAYS = 36  # directions over half a turn
+ROW_CELLS, ROW_CONTRAST = (
+    8,
+    2.4,
+)  # a row has so many cells in its strip, and so many times the mean of all strips
+HOUSE_M, BARRIER_M = 9.0, 2.5  # lengths from which a straight row is a house front, and a wall
+LONELY_CELLS = 4  # a group of so few cells is a pole
+VEHICLE_M = (1.2, 5.5)  # sizes of lonely groups that are vehicles
+GROUND_TILE_M = 8.0
+
+
+class Kind(IntEnum):
+    """What a cell of the map is taken for."""
+
+    FACADE = 0
+    WALL = 1
+    PLANT = 2
+    POLE = 3
+    VEHICLE = 4
+
+
+@dataclass(frozen=True)
+class Cells:
+    """The occupied cells of a map and what they are taken for.
+
+    Attributes
+    ----------
+    points : array, shape (n, 2)
+        Places; those of straight rows are moved onto their line [m].
+    headings : array, shape (n,)
+        Direction of the row that a cell belongs to [rad].
+    kinds : array, shape (n,), uint8
+        `Kind` of each cell.
+    groups : array, shape (n,), int64
+        Number of the connected group that it belongs to: one house front, one hedge, one pole.
+    """
+
+    points: np.ndarray
+    headings: np.ndarray
+    kinds: np.ndarray
+    groups: np.ndarray
+
+    def take(self, index: np.ndarray) -> Cells:
+        """Give some of the cells."""
+        return Cells(self.points[index], self.headings[index], self.kinds[index], self.groups[index])
+
+
+def classify_cells(points: np.ndarray) -> Cells:
+    """Guess from its neighbourhood what stands on each occupied cell of a map.
+
+    Parameters
+    ----------
+    points : array, shape (n, 2)
+        Middles of the occupied cells [m].
+
+    Returns
+    -------
+    cells : Cells
+        In the same order.
+
+    Raises
+    ------
+    ValueError
+        If the map is empty or not finite.
+    """
+    points = np.asarray(points, dtype=np.float64)
+    if points.ndim != 2 or points.shape[1] != 2 or len(points) == 0 or not np.isfinite(points).all():
+        raise ValueError(f"map: expected a finite array (n, 2) with at least one point, got {points.shape}")
+    pairs = cKDTree(points).query_pairs(REACH_M, output_type="ndarray")
+    counts = _count_strips(points, pairs, N_WAYS, STRIP_M)
+    best = counts.argmax(axis=1)
+    in_row = counts[np.arange(len(points)), best]
+    is_straight = (in_row >= ROW_CELLS) & (in_row > ROW_CONTRAST * counts.mean(axis=1))
+    headings, on_line = _fit_strips(points, pairs, np.pi * best / N_WAYS, STRIP_M)
+    n_near = 1 + np.bincount(pairs.ravel(), minlength=len(points))
+    groups = _link(points, headings, is_straight)
+    size, count = _group_sizes(points, groups)
+    kinds = np.full(len(points), Kind.PLANT, dtype=np.uint8)
+    kinds[is_straight & (size >= BARRIER_M)] = Kind.WALL
+    kinds[is_straight & (size >= HOUSE_M)] = Kind.FACADE
+    is_lonely = n_near <= count + 2
+    kinds[~is_straight & is_lonely & (count <= LONELY_CELLS)] = Kind.POLE
+    is_car = (size >= VEHICLE_M[0]) & (size <= VEHICLE_M[1]) & (count > LONELY_CELLS)
+    kinds[is_lonely & is_car & (kinds == Kind.PLANT)] = Kind.VEHICLE
+    is_row = kinds <= Kind.WALL
+    return Cells(np.where(is_row[:, None], on_line, points), headings, kinds, groups)
+
+
+def crop_cells(cells: Cells, places: np.ndarray, radius: float) -> Cells:
+    """Keep the cells within a radius of any of some places, shape (m, 2) [m]."""
+    near = cKDTree(places).query(cells.points, distance_upper_bound=radius)[0]
+    return cells.take(np.flatnonzero(np.isfinite(near)))
+
+
+@njit(cache=True)
+def _count_strips(points, pairs, n_ways, half):  # pragma: no cover (compiled)
+    """Count, for each point and each of n directions over half a turn, the neighbours in a strip through it."""
+    counts = np.ones((len(points), n_ways), dtype=np.int32)
+    for k in range(len(pairs)):
+        i, j = pairs[k, 0], pairs[k, 1]
+        dx, dy = points[j, 0] - points[i, 0], points[j, 1] - points[i, 1]
+        distance = np.hypot(dx, dy)
+        middle = np.arctan2(dy, dx) * n_ways / np.pi
+        reach = n_ways / 2.0 if distance <= half else np.arcsin(half / distance) * n_ways / np.pi
+        for way in range(int(np.ceil(middle - reach)), int(np.ceil(middle + reach))):
+            counts[i, way % n_ways] += 1
+            counts[j, way % n_ways] += 1
+    return counts
+
+
+def _fit_strips(
+    points: np.ndarray, pairs: np.ndarray, headings: np.ndarray, half: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Fit a line to the neighbours in each point's strip: its heading [rad], and the point moved onto it."""
+    first, second = np.concatenate([pairs, pairs[:, ::-1]]).T
+    dx, dy = (points[second] - points[first]).T
+    c, s = np.cos(headings), np.sin(headings)
+    along, across = c[first] * dx + s[first] * dy, c[first] * dy - s[first] * dx
+    inside = np.abs(across) <= half
+    first, along, across = first[inside], along[inside], across[inside]
+
+    def mean(values: np.ndarray) -> np.ndarray:
+        return np.bincount(first, values, len(points)) / (1.0 + np.bincount(first, minlength=len(points)))
+
+    u, v = mean(along), mean(across)
+    slope = (mean(along * across) - u * v) / np.maximum(mean(along**2) - u**2, 1e-9)
+    offset = v - slope * u  # where the line passes beside the point
+    return headings + np.arctan(slope), points + offset[:, None] * np.column_stack([-s, c])
+
+
+def _link(points: np.ndarray, headings: np.ndarray, is_straight: np.ndarray) -> np.ndarray:
+    """Number the connected groups: cells of straight rows that go the same way, and the rest."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    a, b = cKDTree(points).query_pairs(ROW_LINK_M, output_type="ndarray").T
+    same_way = np.abs(np.sin(headings[a] - headings[b])) < np.sin(ROW_BEND)
+    near = np.hypot(*(points[a] - points[b]).T) < LINK_M
+    linked = np.where(is_straight[a], same_way, near) & (is_straight[a] == is_straight[b])
+    a, b = a[linked], b[linked]
+    links = coo_array((np.ones(len(a), dtype=bool), (a, b)), shape=(len(points),) * 2)
+    return connected_components(links, directed=False)[1].astype(np.int64)
+
+
+def _group_sizes(points: np.ndarray, groups: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Diagonal of the box around each point's group [m], and the number of cells in it."""
+    order = np.argsort(groups, kind="stable")
+    starts = np.flatnonzero(np.diff(groups[order], prepend=-1))
+    low = np.minimum.reduceat(points[order], starts)
+    high = np.maximum.reduceat(points[order], starts)
+    return np.hypot(*(high - low).T)[groups], np.bincount(groups)[groups]
+
+
+def change_cells(
+    cells: Cells, rng: np.random.Generator, *, missing_share: float = 0.05, plant_spread_m: float = 0.25
+) -> Cells:
+    """Let time pass since the map was made.
+
+    Parameters
+    ----------
+    cells : Cells
+        The map as it was.
+    rng : numpy.random.Generator
+        Draws the changes.
+    missing_share : float
+        Share of the poles, vehicles and plants that are gone, whole groups of them. Walls and fronts stay,
+        but a fifth of this share of their cells is hidden or open: doors, gates.
+    plant_spread_m : float
+        How far leaves and twigs are from where they were, standard deviation [m].
+
+    Returns
+    -------
+    cells : Cells
+        What is left.
+    """
+    n_groups = int(cells.groups.max(initial=-1)) + 1
+    is_row = cells.kinds <= Kind.WALL
+    gone = rng.random(n_groups)[cells.groups] < missing_share
+    open_ = rng.random(len(cells.points)) < 0.2 * missing_share
+    kept = cells.take(np.flatnonzero(np.where(is_row, ~open_, ~gone)))
+    shift = rng.normal(0.0, plant_spread_m, kept.points.shape) * (kept.kinds == Kind.PLANT)[:, None]
+    return Cells(kept.points + shift, kept.headings, kept.kinds, kept.groups)
+
+
+def add_unmapped(
+    cells: Cells, lane: np.ndarray, rng: np.random.Generator, *, share: float = 0.1, clear_m: float = 3.0
+) -> Cells:
+    """Add what the map does not show: posts, bins, shrubs, things too low or too thin for its maker.
+
+    Parameters
+    ----------
+    cells : Cells
+        The map.
+    lane : array, shape (m, 2)
+        Places that stay free, those where the car drives [m].
+    rng : numpy.random.Generator
+        Draws them.
+    share : float
+        Groups added, as a share of the groups of the map. Each stands some metres from a mapped cell, two in
+        five a lonely post, the others shrubs of four to twelve cells.
+    clear_m : float
+        How far from the lane they stay [m].
+
+    Returns
+    -------
+    cells : Cells
+        The map and what was added; their group numbers follow those of the map.
+    """
+    first = int(cells.groups.max(initial=-1)) + 1
+    n = round(share * len(np.unique(cells.groups)))
+    anchors = cells.points[rng.integers(len(cells.points), size=n)] + rng.normal(0.0, 3.0, (n, 2))
+    anchors = anchors[cKDTree(lane).query(anchors)[0] > clear_m]
+    is_post = rng.random(len(anchors)) < 0.7
+    sizes = np.where(is_post, 1, rng.integers(4, 13, len(anchors)))
+    owner = np.repeat(np.arange(len(anchors)), sizes)
+    points = anchors[owner] + rng.normal(0.0, 0.35, (len(owner), 2)) * ~is_post[owner, None]
+    kinds = np.where(is_post, Kind.POLE, Kind.PLANT).astype(np.uint8)[owner]
+    turns = rng.uniform(0.0, np.pi, len(owner))
+    return Cells(
+        np.concatenate([cells.points, points]), np.concatenate([cells.headings, turns]),
+        np.concatenate([cells.kinds, kinds]), np.concatenate([cells.groups, first + owner]),
+    )  # fmt: skip
+
+
+def build_pieces(cells: Cells, seed: int, *, leaf_density: float = 1.0) -> Mesh:
+    """Raise the cells of a map to upright pieces.
+
+    Parameters
+    ----------
+    cells : Cells
+        What stands where.
+    seed : int
+        Draws heights and shapes; those of a group are the same however many of its cells are asked for.
+    leaf_density : float
+        Leaves on the plants, 1 is usual.
+
+    Returns
+    -------
+    mesh : Mesh
+        FACADE 4 to 9 m and WALL 1.3 to 2.8 m high, TREE_CROWN flakes above a HEDGE-like foot, METAL poles,
+        VEHICLE faces; the object number is that of the group.
+    """
+    from .mesh import merge_meshes
+
+    builders = {
+        Kind.FACADE: _build_rows, Kind.WALL: _build_rows, Kind.PLANT: _build_plants, Kind.POLE: _build_poles,
+        Kind.VEHICLE: _build_vehicle_sides,
+    }  # fmt: skip
+    meshes = []
+    for kind, build in builders.items():
+        own = cells.take(np.flatnonzero(cells.kinds == kind))
+        if len(own.points):
+            meshes.append(build(own, kind, seed, leaf_density))
+    return merge_meshes(meshes)
+
+
+def _draw(numbers: np.ndarray, seed: int, salt: int) -> np.ndarray:
+    """Numbers in [0, 1) that depend on the given whole numbers alone."""
+    h = numbers.astype(np.uint64) * np.uint64(0x9E3779B97F4A7C15)
+    h ^= np.uint64((seed * 0x1000193 + salt * 0x85EBCA6B) & 0xFFFFFFFFFFFF)
+    for shift, factor in ((31, 0x7FB5D329728EA185), (27, 0x81DADEF4BC2DD44D)):
+        h = (h ^ (h >> np.uint64(shift))) * np.uint64(factor)
+    return (h ^ (h >> np.uint64(33))).astype(np.float64) / 2.0**64
+
+
+def _cell_numbers(points: np.ndarray) -> np.ndarray:
+    """A whole number for every place, the same whichever cells are at hand."""
+    u = np.floor(points / 0.25).astype(np.int64)
+    return (u[:, 0] * 0x1F123BB5 + u[:, 1] * 0x5851F42D).astype(np.uint64)
+
+
+def _build_rows(cells: Cells, kind: Kind, seed: int, leaf_density: float) -> Mesh:
+    """Upright strips along the row; neighbours overlap, so that a row of cells is closed."""
+    from .mesh import Material
+
+    low, high = (4.0, 9.0) if kind == Kind.FACADE else (1.3, 2.8)
+    top = low + (high - low) * _draw(cells.groups, seed, 1)
+    material = Material.FACADE if kind == Kind.FACADE else Material.WALL
+    return _build_strips(cells.points, cells.headings, 0.27, -0.2, top, material, cells.groups)
+
+
+def _build_vehicle_sides(cells: Cells, kind: Kind, seed: int, leaf_density: float) -> Mesh:
+    from .mesh import Material
+
+    top = 1.4 + 0.8 * _draw(cells.groups, seed, 2) ** 3
+    return _build_strips(cells.points, cells.headings, 0.25, 0.2, top, Material.VEHICLE, cells.groups)
+
+
+def _build_poles(cells: Cells, kind: Kind, seed: int, leaf_density: float) -> Mesh:
+    """Two crossed strips: a slim pole that is seen from all sides."""
+    from .mesh import Material, merge_meshes
+
+    radius = 0.04 + 0.08 * _draw(cells.groups, seed, 3)
+    top = 1.0 + 5.0 * _draw(cells.groups, seed, 4)
+    turn = np.pi * _draw(cells.groups, seed, 5)
+    halves = [
+        _build_strips(cells.points, turn + quarter, radius, 0.0, top, Material.METAL, cells.groups)
+        for quarter in (0.0, 0.5 * np.pi)
+    ]
+    return merge_meshes(halves)
+
+
+def _build_plants(cells: Cells, kind: Kind, seed: int, leaf_density: float) -> Mesh:
+    """Flakes of leaves, up to two for every metre of height, turned at random."""
+    from .mesh import Material, merge_meshes
+
+    numbers = _cell_numbers(cells.points)
+    height = 0.8 + 4.5 * _draw(cells.groups, seed, 6) * _draw(numbers, seed, 7)
+    meshes = []
+    for layer in range(8):
+        here = np.flatnonzero(
+            (0.6 * layer < height) & (_draw(numbers, seed, 20 + layer) < 0.5 * leaf_density)
+        )
+        side = 0.15 + 0.25 * _draw(numbers[here], seed, 30 + layer)
+        z = 0.6 * (layer + _draw(numbers[here], seed, 40 + layer))
+        away = 0.3 * (np.stack([_draw(numbers[here], seed, 50 + layer + 10 * k) for k in (0, 1)], 1) - 0.5)
+        turn = np.pi * _draw(numbers[here], seed, 70 + layer)
+        material = Material.HEDGE if layer == 0 else Material.TREE_CROWN
+        meshes.append(
+            _build_strips(
+                cells.points[here] + away, turn, side, z, z + 2.0 * side, material, cells.groups[here]
+            )
+        )
+    return merge_meshes(meshes)
+
+
+def _build_strips(
+    points: np.ndarray,
+    headings: np.ndarray,
+    half: np.ndarray | float,
+    low: np.ndarray | float,
+    high: np.ndarray | float,
+    material: int,
+    groups: np.ndarray,
+) -> Mesh:
+    """Upright rectangles, `half` to both sides of each point along its heading, from `low` to `high` [m]."""
+    from .mesh import make_mesh
+
+    n = len(points)
+    step = np.broadcast_to(half, n)[:, None] * np.column_stack([np.cos(headings), np.sin(headings)])
+    low, high = np.broadcast_to(low, n), np.broadcast_to(high, n)
+    left, right = points - step, points + step
+    corners = np.stack([
+        np.column_stack([left, low]), np.column_stack([right, low]),
+        np.column_stack([right, high]), np.column_stack([left, high]),
+    ], axis=1)  # fmt: skip
+    first = 4 * np.arange(n)[:, None]
+    triangles = np.stack([first + (0, 1, 2), first + (0, 2, 3)], axis=1)
+    return make_mesh(corners.reshape(-1, 3), triangles.reshape(-1, 3), material, np.repeat(groups, 2))
+
+
+def build_ground(places: np.ndarray, radius: float, object_id: int = -2) -> Mesh:
+    """Lay flat ground within a radius of some places: tiles of 8 m.
+
+    Parameters
+    ----------
+    places : array, shape (m, 2)
+        Places, such as the poses of a drive [m].
+    radius : float
+        How far the ground reaches [m].
+    object_id : int
+        Object number of the ground.
+
+    Returns
+    -------
+    mesh : Mesh
+        GROUND at z = 0.
+    """
+    from .mesh import Material, make_mesh
+
+    side, reach = GROUND_TILE_M, int(np.ceil(radius / GROUND_TILE_M))
+    tiles = np.unique(np.floor(np.asarray(places)[:, :2] / side).astype(np.int64), axis=0)
+    around = np.stack(np.meshgrid(*[np.arange(-reach, reach + 1)] * 2, indexing="ij"), -1).reshape(-1, 2)
+    around = around[np.hypot(*around.T) <= reach]
+    tiles = np.unique((tiles[:, None] + around[None]).reshape(-1, 2), axis=0)
+    square = np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
+    corners = side * (tiles[:, None] + square[None]).reshape(-1, 2)
+    first = 4 * np.arange(len(tiles))[:, None]
+    triangles = np.stack([first + (0, 1, 2), first + (0, 2, 3)], axis=1).reshape(-1, 3)
+    return make_mesh(
+        np.column_stack([corners, np.zeros(len(corners))]), triangles, Material.GROUND, object_id
+    )

@@ -1,0 +1,91 @@
+"""The readers of the real map, poses and odometry, and what they say of files that are at fault."""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from rol import rall
+
+
+def test_real_map_and_poses_belong_together(real_root: Path) -> None:
+    points = rall.load_map_points(real_root / rall.MAP_PATH)
+    poses = rall.load_poses(real_root / rall.POSES_PATH / "pose_xy_01.txt")
+    assert points.shape == (399_468, 2) and poses.shape == (8_866, 3)
+    assert points[:, 0].max() < 1500.0 and points[:, 1].max() < 800.0
+    near = np.hypot(*(points - poses[4000, :2]).T)
+    assert (near < 30.0).sum() > 200 and near.min() > 0.5  # a street with sides, and nothing on the lane
+
+
+def test_real_odometry_follows_the_real_poses(real_root: Path) -> None:
+    steps = rall.load_odometry(real_root / rall.ODOMETRY_PATH / "seq02_odom.txt")
+    poses = rall.load_poses(real_root / rall.POSES_PATH / "pose_xy_02.txt")
+    n = len(poses) - 1
+    way = np.hypot(*np.diff(poses[:, :2], axis=0).T).sum()
+    assert np.hypot(steps[:n, 0], steps[:n, 1]).sum() == pytest.approx(way, rel=0.03)
+
+
+def test_real_scan_poses(real_root: Path) -> None:
+    poses = rall.load_scan_poses(real_root / rall.SCAN_POSES_PATH)
+    assert len(poses) == 11 and min(poses) == 1547131046353776
+    np.testing.assert_allclose(poses[1547131046353776], [146.619, -10.956, -0.06091])
+
+
+def test_find_real_root(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("ROL_REAL_ROOT", raising=False)
+    assert rall.find_real_root() is None and rall.find_real_root(tmp_path) is None
+    path = tmp_path / "here" / rall.MAP_PATH
+    path.parent.mkdir(parents=True)
+    path.write_bytes(b"")
+    assert rall.find_real_root(tmp_path / "here") == tmp_path / "here"
+    monkeypatch.setenv("ROL_REAL_ROOT", str(tmp_path / "here"))
+    assert rall.find_real_root() == tmp_path / "here"
+    assert rall.find_real_root(tmp_path / "elsewhere") is None  # what is asked for by name is not replaced
+
+
+def test_map_cells_lie_where_the_readme_says(tmp_path: Path) -> None:
+    image = np.zeros((40, 30), dtype=np.uint8)
+    image[4, 8] = 255
+    cv2.imwrite(str(tmp_path / "map.png"), image)
+    x, y = rall.load_map_points(tmp_path / "map.png")[0]
+    assert int((1500.0 - x) / 0.25) == 4 and int((800.0 - y) / 0.25) == 8
+
+
+@pytest.mark.parametrize(
+    ("content", "fault"),
+    [
+        (None, "missing"),
+        ("", r"expected rows of three numbers"),
+        ("1 2\n3 4\n", r"expected rows of three numbers"),
+        ("1 2 three\n", "not a table of numbers"),
+        ("0 0 0\n1 nan 0\n", "row 2 is not finite"),
+    ],
+)
+@pytest.mark.filterwarnings("ignore:loadtxt")
+def test_faulty_poses_are_named(tmp_path: Path, content: str | None, fault: str) -> None:
+    path = tmp_path / "pose_xy_03.txt"
+    if content is not None:
+        path.write_text(content)
+    with pytest.raises(rall.RallError, match=f"pose_xy_03.txt: .*{fault}"):
+        rall.load_poses(path)
+
+
+def test_faulty_maps_and_scan_poses_are_named(tmp_path: Path) -> None:
+    path = tmp_path / "map.png"
+    with pytest.raises(rall.RallError, match=r"map.png: missing or not a picture"):
+        rall.load_map_points(path)
+    cv2.imwrite(str(path), np.zeros((4, 4), dtype=np.uint8))
+    with pytest.raises(rall.RallError, match="holds no occupied cell"):
+        rall.load_map_points(path)
+    cv2.imwrite(str(path), np.zeros((4, 4, 3), dtype=np.uint8))
+    with pytest.raises(rall.RallError, match="one grey channel"):
+        rall.load_map_points(path)
+    table = tmp_path / "poses.csv"
+    with pytest.raises(rall.RallError, match=r"poses.csv: missing"):
+        rall.load_scan_poses(table)
+    for row, fault in (("12,1.0,2.0,nan", "all finite"), ("noon,1,2,3", "line 2")):
+        table.write_text(f"timestamp_us,x_m,y_m,yaw_rad\n{row}\n")
+        with pytest.raises(rall.RallError, match=fault):
+            rall.load_scan_poses(table)
