@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from rol.geometry import accumulate_steps, invert, relative_pose, transform_points
-from rol.odometry import OdometryError, chain, fit_rigid, icp_2d, steps_of
+from rol.odometry import OdometryError, chain, fit_rigid, icp_2d, search_motion, steps_of
 
 
 def posts(n: int = 250) -> np.ndarray:
@@ -119,3 +119,45 @@ def test_chain_goes_on_through_an_empty_cloud():
 def test_chain_of_one_or_no_cloud_has_no_step():
     assert steps_of(chain([posts()])).shape == (0, 3)
     assert steps_of(chain([])).shape == (0, 3)
+
+
+def thick_street(rng: np.random.Generator) -> np.ndarray:
+    """Two thick house fronts with recesses and some posts, on the grid of a generated image."""
+    x = np.arange(-40.0, 40.0, 0.25)
+    fronts = [
+        np.column_stack([x, np.full_like(x, side + depth) + 1.5 * ((x // 7) % 3 == 0)])
+        for side in (-9.0, 8.0)
+        for depth in np.arange(0.0, 1.0, 0.25)
+    ]
+    posts = np.repeat(rng.uniform((-40.0, -6.0), (40.0, 6.0), (12, 2)), 9, axis=0)
+    return np.concatenate([*fronts, posts + rng.uniform(-0.4, 0.4, posts.shape)])
+
+
+def seen_from(pose: tuple[float, float, float], world: np.ndarray) -> np.ndarray:
+    local = transform_points(relative_pose(np.array(pose), np.zeros(3)), world)
+    near = local[np.hypot(*local.T) < 30.0]
+    return np.unique(np.round(near / 0.25) * 0.25, axis=0)
+
+
+@pytest.mark.parametrize("motion", [(1.3, -0.2, 0.03), (-0.9, 0.4, -0.06), (0.0, 0.0, 0.0)])
+def test_search_finds_a_motion_far_from_the_guess(motion: tuple[float, float, float]) -> None:
+    world = thick_street(np.random.default_rng(0))
+    found = search_motion(seen_from(motion, world), seen_from((0.0, 0.0, 0.0), world))
+    assert np.hypot(*(found - motion)[:2]) < 0.16 and abs(found[2] - motion[2]) < 0.01
+
+
+def test_search_follows_a_car_that_gains_speed() -> None:
+    world = thick_street(np.random.default_rng(1))
+    steps = np.linspace(0.1, 2.2, 8)
+    clouds = [seen_from((x, 0.0, 0.0), world) for x in np.concatenate([[0.0], np.cumsum(steps)]) - 9.0]
+    plain, searched = (steps_of(chain(clouds, search=search))[:, 0] for search in (False, True))
+    assert np.abs(searched - steps).max() < 0.16
+    assert np.abs(plain - steps).max() > np.abs(searched - steps).max()
+
+
+def test_search_without_points_gives_the_guess_and_refuses_bad_ones() -> None:
+    cloud, guess = np.random.default_rng(0).normal(size=(20, 2)), np.array([0.5, 0.0, 0.1])
+    for source, target in ((np.zeros((0, 2)), cloud), (cloud, np.zeros((0, 2)))):
+        np.testing.assert_array_equal(search_motion(source, target, guess), guess)
+    with pytest.raises(OdometryError, match="source cloud: point 0 is not finite"):
+        search_motion(np.full((4, 2), np.nan), cloud)

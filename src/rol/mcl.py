@@ -40,8 +40,9 @@ class MclSettings:
         Matching distance of Eq. 9 [m]. 0.5: two image pixels, about the width of a wall in the map.
     noise_forward_m, noise_side_m, noise_yaw_rad : float
         Standard deviations added to every step, moving or not [m, m, rad]. 0.5 m, 0.3 m and 1 deg: ICP between
-        the demo's fake clouds was seen up to 1 m short in a step while the car gains speed (why is not settled).
-        0.2 m, 0.2 m and 0.5 deg lost the pose on two of its four sessions; these values were chosen after that.
+        fake clouds is up to 0.8 m short in a step while the car gains speed, for it stays near its first guess (see
+        `odometry.search_motion`). 0.2 m, 0.2 m and 0.5 deg lost the pose on two of the demo's four sessions as they
+        were first simulated; these values were chosen after that.
     noise_per_m, noise_yaw_per_rad : float
         Standard deviation added per metre driven and per radian turned; 0.03 is twice the 1.5 % by which the
         authors' published odometry is short.

@@ -93,13 +93,13 @@ def classify_cells(points: np.ndarray) -> Cells:
     points = np.asarray(points, dtype=np.float64)
     if points.ndim != 2 or points.shape[1] != 2 or len(points) == 0 or not np.isfinite(points).all():
         raise ValueError(f"map: expected a finite array (n, 2) with at least one point, got {points.shape}")
-    pairs = cKDTree(points).query_pairs(REACH_M, output_type="ndarray")
-    counts = _count_strips(points, pairs, N_WAYS, STRIP_M)
+    order, cell_of, starts = _sort_into_cells(points, REACH_M)
+    counts, n_near = _count_strips(points, order, cell_of, starts, REACH_M, STRIP_M, N_WAYS)
     best = counts.argmax(axis=1)
     in_row = counts[np.arange(len(points)), best]
     is_straight = (in_row >= ROW_CELLS) & (in_row > ROW_CONTRAST * counts.mean(axis=1))
-    headings, on_line = _fit_strips(points, pairs, np.pi * best / N_WAYS, STRIP_M)
-    n_near = 1 + np.bincount(pairs.ravel(), minlength=len(points))
+    ways = np.pi * best / N_WAYS
+    headings, on_line = _fit_strips(points, order, cell_of, starts, REACH_M, STRIP_M, ways)
     groups = _link(points, headings, is_straight)
     size, count = _group_sizes(points, groups)
     kinds = np.full(len(points), Kind.PLANT, dtype=np.uint8)
@@ -119,40 +119,62 @@ def crop_cells(cells: Cells, places: np.ndarray, radius: float) -> Cells:
     return cells.take(np.flatnonzero(np.isfinite(near)))
 
 
+def _sort_into_cells(points: np.ndarray, side: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Sort points into square cells: their order, each one's cell, and where each cell begins, by row and column."""
+    cell_of = np.floor((points - points.min(axis=0)) / side).astype(np.int64)
+    shape = cell_of.max(axis=0) + 1
+    flat = cell_of[:, 0] * shape[1] + cell_of[:, 1]
+    order = np.argsort(flat, kind="stable")
+    starts = np.searchsorted(flat[order], np.arange(shape[0] * shape[1] + 1))
+    return order, cell_of, np.stack([starts[:-1], starts[1:]], axis=-1).reshape(*shape, 2)
+
+
 @njit(cache=True)
-def _count_strips(points, pairs, n_ways, half):  # pragma: no cover (compiled)
+def _count_strips(points, order, cell_of, starts, reach, half, n_ways):  # pragma: no cover (compiled)
     """Count, for each point and each of n directions over half a turn, the neighbours in a strip through it."""
-    counts = np.ones((len(points), n_ways), dtype=np.int32)
-    for k in range(len(pairs)):
-        i, j = pairs[k, 0], pairs[k, 1]
-        dx, dy = points[j, 0] - points[i, 0], points[j, 1] - points[i, 1]
-        distance = np.hypot(dx, dy)
-        middle = np.arctan2(dy, dx) * n_ways / np.pi
-        reach = n_ways / 2.0 if distance <= half else np.arcsin(half / distance) * n_ways / np.pi
-        for way in range(int(np.ceil(middle - reach)), int(np.ceil(middle + reach))):
-            counts[i, way % n_ways] += 1
-            counts[j, way % n_ways] += 1
-    return counts
+    counts = np.ones((len(points), n_ways), dtype=np.int16)
+    n_near = np.zeros(len(points), dtype=np.int64)
+    for i in range(len(points)):
+        row, column = cell_of[i]
+        for r in range(max(row - 1, 0), min(row + 2, starts.shape[0])):
+            for c in range(max(column - 1, 0), min(column + 2, starts.shape[1])):
+                for k in range(starts[r, c, 0], starts[r, c, 1]):
+                    dx, dy = points[order[k], 0] - points[i, 0], points[order[k], 1] - points[i, 1]
+                    distance = np.hypot(dx, dy)
+                    if distance > reach:
+                        continue
+                    n_near[i] += 1
+                    if order[k] == i:
+                        continue
+                    middle = np.arctan2(dy, dx) * n_ways / np.pi
+                    width = n_ways / 2.0 if distance <= half else np.arcsin(half / distance) * n_ways / np.pi
+                    for way in range(int(np.ceil(middle - width)), int(np.ceil(middle + width))):
+                        counts[i, way % n_ways] += 1
+    return counts, n_near
 
 
-def _fit_strips(
-    points: np.ndarray, pairs: np.ndarray, headings: np.ndarray, half: float
-) -> tuple[np.ndarray, np.ndarray]:
+@njit(cache=True)
+def _fit_strips(points, order, cell_of, starts, reach, half, ways):  # pragma: no cover (compiled)
     """Fit a line to the neighbours in each point's strip: its heading [rad], and the point moved onto it."""
-    first, second = np.concatenate([pairs, pairs[:, ::-1]]).T
-    dx, dy = (points[second] - points[first]).T
-    c, s = np.cos(headings), np.sin(headings)
-    along, across = c[first] * dx + s[first] * dy, c[first] * dy - s[first] * dx
-    inside = np.abs(across) <= half
-    first, along, across = first[inside], along[inside], across[inside]
-
-    def mean(values: np.ndarray) -> np.ndarray:
-        return np.bincount(first, values, len(points)) / (1.0 + np.bincount(first, minlength=len(points)))
-
-    u, v = mean(along), mean(across)
-    slope = (mean(along * across) - u * v) / np.maximum(mean(along**2) - u**2, 1e-9)
-    offset = v - slope * u  # where the line passes beside the point
-    return headings + np.arctan(slope), points + offset[:, None] * np.column_stack([-s, c])
+    headings, moved = ways.copy(), points.copy()
+    for i in range(len(points)):
+        row, column = cell_of[i]
+        cosine, sine = np.cos(ways[i]), np.sin(ways[i])
+        n, u, v, uu, uv = 0, 0.0, 0.0, 0.0, 0.0
+        for r in range(max(row - 1, 0), min(row + 2, starts.shape[0])):
+            for c in range(max(column - 1, 0), min(column + 2, starts.shape[1])):
+                for k in range(starts[r, c, 0], starts[r, c, 1]):
+                    dx, dy = points[order[k], 0] - points[i, 0], points[order[k], 1] - points[i, 1]
+                    along, across = cosine * dx + sine * dy, cosine * dy - sine * dx
+                    if dx * dx + dy * dy <= reach * reach and abs(across) <= half:
+                        n, u, v = n + 1, u + along, v + across
+                        uu, uv = uu + along * along, uv + along * across
+        u, v = u / n, v / n
+        slope = (uv / n - u * v) / max(uu / n - u * u, 1e-9)
+        headings[i] += np.arctan(slope)
+        moved[i, 0] -= (v - slope * u) * sine
+        moved[i, 1] += (v - slope * u) * cosine
+    return headings, moved
 
 
 def _link(points: np.ndarray, headings: np.ndarray, is_straight: np.ndarray) -> np.ndarray:

@@ -1,0 +1,108 @@
+"""How fast virtual sensors are, and where the time goes.
+
+python benchmarks/simulator.py [--scans 40]      prints a table and writes build/benchmarks/simulator.json
+
+Medians over scans of one process on one thread; the sessions of a drive are written by as many processes as wanted. With
+the real data at hand the world is that of the route, without them the virtual town.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import resource
+import tempfile
+from pathlib import Path
+from time import perf_counter
+
+import numpy as np
+
+from rol import oxford, rall
+from rol.virtual import radar_sensor, radar_signal
+from rol.virtual.session import VirtualSession, build_session, make_scan, make_sweep, sensor_settings
+from rol.virtual.settings import load_settings
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+def open_drive() -> tuple[VirtualSession, float]:
+    """Build a session of the route, or of the town without the real data; gives also the seconds it took."""
+    config = "route" if rall.find_real_root() else "demo"
+    settings = load_settings(ROOT / "config" / f"{config}.yaml")
+    begin = perf_counter()
+    session = build_session(settings, list(settings.sessions)[1])
+    return session, perf_counter() - begin
+
+
+def time_scan(session: VirtualSession, index: int, folder: Path) -> dict[str, float]:
+    """Time the parts of one radar scan [ms]."""
+    settings = sensor_settings(session.settings)[1]
+    stamp, turn = int(session.scans_us[index]), int(session.turns_us[index])
+    rng = np.random.default_rng(index)
+    times = stamp + (np.arange(400) + 0.5) * turn / 400
+    marks = [perf_counter()]
+    scene = session.scene_at(stamp + 0.5 * turn)
+    marks.append(perf_counter())
+    rays = radar_sensor.emit_rays(session.drive.pose(times), rng, settings)
+    marks.append(perf_counter())
+    rows, ranges, powers, _, _ = radar_sensor.trace_echoes(scene, rays, settings)
+    marks.append(perf_counter())
+    codes = radar_signal.echoes_to_codes(rows, radar_signal.range_to_bins(ranges), powers, rng)
+    marks.append(perf_counter())
+    scan = make_scan(session, index)
+    whole = perf_counter() - marks[-1]
+    begin = perf_counter()
+    oxford.save_radar(folder / f"{scan.stamp_us}.png", scan)
+    written = perf_counter() - begin
+    assert codes.shape == scan.codes.shape
+    names = ("traffic", "rays sent", "rays traced", "signal")
+    parts = dict(zip(names, np.diff(marks), strict=True))
+    found = {**parts, "file written": written, "whole scan": whole + written, "echoes": len(rows) / 1000.0}
+    return {name: 1000.0 * float(value) for name, value in found.items()}
+
+
+def time_sweep(session: VirtualSession, index: int, folder: Path) -> dict[str, float]:
+    """Time one lidar sweep [ms]."""
+    begin = perf_counter()
+    sweep = make_sweep(session, "velodyne_left", index)
+    made = perf_counter()
+    raw = oxford.VelodyneRaw(sweep.intensities, sweep.ranges, sweep.angles, sweep.stamps_us)
+    oxford.save_velodyne_raw(folder / "sweep.png", raw)
+    return {"sweep": 1000.0 * (made - begin), "sweep written": 1000.0 * (perf_counter() - made)}
+
+
+def main() -> None:
+    """Measure, print, and write the table."""
+    parser = argparse.ArgumentParser(description="How fast virtual sensors are, and where the time goes.")
+    parser.add_argument("--scans", type=int, default=40)
+    given = parser.parse_args()
+    session, built_s = open_drive()
+    indices = np.linspace(5, len(session.scans_us) - 5, given.scans).astype(int)
+    with tempfile.TemporaryDirectory() as folder:
+        time_scan(session, int(indices[0]), Path(folder))  # compiles
+        rows = [time_scan(session, int(i), Path(folder)) for i in indices]
+        sweeps = [
+            time_sweep(session, int(i), Path(folder)) for i in np.linspace(5, 2000, given.scans).astype(int)
+        ]
+    medians = {name: float(np.median([row[name] for row in rows])) for name in rows[0]}
+    medians |= {name: float(np.median([row[name] for row in sweeps])) for name in sweeps[0]}
+    report = {
+        "session": session.name,
+        "triangles": len(session.scene.static_mesh.triangles),
+        "world built [s]": built_s,
+        **{f"{name} [ms]" if name != "echoes" else "echoes a scan": value for name, value in medians.items()},
+        "scans a second": 1000.0 / medians["whole scan"],
+        "sweeps a second": 1000.0 / (medians["sweep"] + medians["sweep written"]),
+        "memory at most [GB]": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6,
+    }
+    for name, value in report.items():
+        print(f"{name:22s} {value:,.3f}" if isinstance(value, float) else f"{name:22s} {value}")
+    target = ROOT / "build" / "benchmarks" / "simulator.json"
+    target.parent.mkdir(parents=True, exist_ok=True)
+    temporary = target.with_suffix(".tmp")
+    temporary.write_text(json.dumps(report, indent=2) + "\n")
+    temporary.replace(target)
+
+
+if __name__ == "__main__":
+    main()
