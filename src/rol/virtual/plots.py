@@ -15,6 +15,7 @@ STYLES = (
     {"color": "#009E73", "linestyle": "--"},
 )
 BIN_M = 0.0438
+GREYS = plt.get_cmap("gray_r", 12)  # few levels: noise in fine ones makes large files and shows no more
 
 
 def draw_statistics(found: Mapping[str, dict]) -> Figure:
@@ -30,7 +31,7 @@ def draw_statistics(found: Mapping[str, dict]) -> Figure:
     figure : Figure
         Six panels.
     """
-    figure, axes = plt.subplots(2, 3, figsize=(9.6, 6.2))
+    figure, axes = plt.subplots(2, 3, figsize=(9.6, 6.2), dpi=84)
     draws = (
         _draw_histogram, _draw_zeros, _draw_range_correlation, _draw_rings, _draw_azimuth_spread, _draw_range_spread,
     )  # fmt: skip
@@ -107,7 +108,7 @@ def draw_polar_pair(
     """
     for ax, (title, codes) in zip(axes, scans.items(), strict=True):
         ax.imshow(
-            codes, cmap="gray_r", aspect="auto", vmin=0, vmax=100, interpolation="antialiased",
+            codes, cmap=GREYS, aspect="auto", vmin=0, vmax=96, interpolation="antialiased",
             extent=(-0.31, -0.31 + BIN_M * codes.shape[1], 360, 0),
         )  # fmt: skip
         ax.set(title=title, xlim=(0, max_range), yticks=np.arange(0, 361, 90), ylabel="azimuth [deg]")
