@@ -245,8 +245,8 @@ def add_unmapped(
     rng : numpy.random.Generator
         Draws them.
     share : float
-        Groups added, as a share of the groups of the map. Each stands some metres from a mapped cell, two in
-        five a lonely post, the others shrubs of four to twelve cells.
+        Groups added, as a share of the groups of the map. Each stands some metres from a mapped cell, seven
+        in ten a lonely post, the others shrubs of four to twelve cells.
     clear_m : float
         How far from the lane they stay [m].
 
