@@ -216,7 +216,7 @@ def _find_route(
     places = thin_points(poses[:, :2], 2.0)[0]
     cells = _read_map(str(rall.find_real_root(settings.real_root) / rall.MAP_PATH))
     cells = mapped.crop_cells(cells, places, WORLD_RADIUS_M)
-    unmapped = np.random.default_rng([settings.seed, 0, 98])  # of the world, but placed by what is left that day
+    unmapped = np.random.default_rng([settings.seed, 0, 98])  # placed by what is left that day
     left = mapped.change_cells(cells, rng(DRESS), missing_share=own.changed_share)
     left = mapped.add_unmapped(left, poses[:, :2], unmapped, share=settings.unmapped_share)
     drive = interpolate_drive(middles_us, poses)
