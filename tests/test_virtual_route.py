@@ -120,10 +120,16 @@ def test_a_week_changes_a_stated_share_and_leaves_the_walls() -> None:
     is_row, was_row = later.kinds <= mapped.Kind.WALL, cells.kinds <= mapped.Kind.WALL
     assert 1.0 - (~is_row).sum() / (~was_row).sum() == pytest.approx(0.2, abs=0.03)
     assert 1.0 - is_row.sum() / was_row.sum() == pytest.approx(0.04, abs=0.02)
-    more = mapped.add_unmapped(cells, np.zeros((1, 2)), np.random.default_rng(4), share=0.5, clear_m=4.0)
-    added = more.points[len(cells.points) :]
-    assert len(np.unique(more.groups)) / len(np.unique(cells.groups)) == pytest.approx(1.5, abs=0.02)
-    assert np.hypot(*added.T).min() > 2.0
+
+
+def test_what_the_map_does_not_show_is_the_same_on_all_days() -> None:
+    cells = mapped.classify_cells(np.random.default_rng(0).uniform(-500.0, 500.0, (3000, 2)))
+    drawn = mapped.draw_unmapped(cells, np.random.default_rng(4), share=0.5)
+    assert len(np.unique(drawn.groups)) / len(np.unique(cells.groups)) == pytest.approx(0.5, abs=0.01)
+    assert drawn.groups.min() > cells.groups.max()
+    kept = mapped.crop_cells(drawn, np.zeros((1, 2)), 300.0, clear_m=40.0)
+    gaps = np.hypot(*drawn.points.T)
+    np.testing.assert_array_equal(kept.points, drawn.points[(gaps >= 40.0) & (gaps <= 300.0)])
 
 
 def test_pieces_have_the_heights_and_materials_of_their_kind() -> None:

@@ -1,5 +1,6 @@
 """Virtual sessions on disk: settings, times, odometry, and a small session written, interrupted and read back."""
 
+import errno
 import hashlib
 import json
 import shutil
@@ -113,6 +114,25 @@ def test_unknown_sensor_settings_are_named(tmp_path: Path, capsys: pytest.Captur
     status = main([str(tmp_path / "tiny.yaml"), "--session", NAME, "--out", str(tmp_path)])
     assert status == 1
     assert "lidar: unknown key 'noise'; known are: range_noise_m" in capsys.readouterr().err
+
+
+def test_a_disk_that_fills_up_is_told_and_what_is_there_is_kept(
+    recipe: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    whole, written = writer._write_scan, []
+
+    def write_until_full(folder: Path, session: object, index: int) -> None:
+        if index == 2:
+            raise OSError(errno.ENOSPC, "No space left on device", str(folder / "radar"))
+        whole(folder, session, index)
+        written.append(index)
+
+    monkeypatch.setattr(writer, "_write_scan", write_until_full)
+    assert main([str(recipe), "--session", NAME, "--out", str(tmp_path)]) == 1
+    told = capsys.readouterr().err
+    assert "No space left on device" in told and "the same command goes on from there" in told
+    assert len(list((tmp_path / NAME / "radar").iterdir())) == len(written) == 2
+    assert not (tmp_path / NAME / "session.json").exists()
 
 
 # ---- times and odometry ----

@@ -39,8 +39,11 @@ def main(arguments: list[str] | None = None) -> int:
             write_session(
                 settings, name, given.out, report=lambda line: print(line, flush=True), jobs=given.jobs
             )
-    except (ValueError, OSError) as error:
+    except ValueError as error:
         print(f"error: {error}", file=sys.stderr)
+        return 1
+    except OSError as error:
+        print(f"error: {error}\nWhat is written stays; the same command goes on from there.", file=sys.stderr)
         return 1
     return 0
 

@@ -8,7 +8,7 @@ that of the map, z up from the road [m].
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from enum import IntEnum
 from typing import TYPE_CHECKING
 
@@ -113,10 +113,10 @@ def classify_cells(points: np.ndarray) -> Cells:
     return Cells(np.where(is_row[:, None], on_line, points), headings, kinds, groups)
 
 
-def crop_cells(cells: Cells, places: np.ndarray, radius: float) -> Cells:
-    """Keep the cells within a radius of any of some places, shape (m, 2) [m]."""
-    near = cKDTree(places).query(cells.points, distance_upper_bound=radius)[0]
-    return cells.take(np.flatnonzero(np.isfinite(near)))
+def crop_cells(cells: Cells, places: np.ndarray, radius: float, *, clear_m: float = 0.0) -> Cells:
+    """Keep the cells within a radius of any of some places, shape (m, 2), and not nearer than `clear_m` [m]."""
+    gaps = cKDTree(places).query(cells.points, distance_upper_bound=radius)[0]
+    return cells.take(np.flatnonzero(np.isfinite(gaps) & (gaps >= clear_m)))
 
 
 def _sort_into_cells(points: np.ndarray, side: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -231,44 +231,40 @@ def change_cells(
     return Cells(kept.points + shift, kept.headings, kept.kinds, kept.groups)
 
 
-def add_unmapped(
-    cells: Cells, lane: np.ndarray, rng: np.random.Generator, *, share: float = 0.1, clear_m: float = 3.0
-) -> Cells:
-    """Add what the map does not show: posts, bins, shrubs, things too low or too thin for its maker.
+def draw_unmapped(cells: Cells, rng: np.random.Generator, *, share: float = 0.1) -> Cells:
+    """Draw what a map does not show: posts, bins, shrubs, things too low or too thin for its maker.
 
     Parameters
     ----------
     cells : Cells
-        The map.
-    lane : array, shape (m, 2)
-        Places that stay free, those where the car drives [m].
+        The whole map.
     rng : numpy.random.Generator
         Draws them.
     share : float
-        Groups added, as a share of the groups of the map. Each stands some metres from a mapped cell, seven
+        Groups drawn, as a share of the groups of the map. Each stands some metres from a mapped cell, seven
         in ten a lonely post, the others shrubs of four to twelve cells.
-    clear_m : float
-        How far from the lane they stay [m].
 
     Returns
     -------
     cells : Cells
-        The map and what was added; their group numbers follow those of the map.
+        What stands there besides; the group numbers follow those of the map.
     """
     first = int(cells.groups.max(initial=-1)) + 1
     n = round(share * len(np.unique(cells.groups)))
     anchors = cells.points[rng.integers(len(cells.points), size=n)] + rng.normal(0.0, 3.0, (n, 2))
-    anchors = anchors[cKDTree(lane).query(anchors)[0] > clear_m]
-    is_post = rng.random(len(anchors)) < 0.7
-    sizes = np.where(is_post, 1, rng.integers(4, 13, len(anchors)))
-    owner = np.repeat(np.arange(len(anchors)), sizes)
+    is_post = rng.random(n) < 0.7
+    sizes = np.where(is_post, 1, rng.integers(4, 13, n))
+    owner = np.repeat(np.arange(n), sizes)
     points = anchors[owner] + rng.normal(0.0, 0.35, (len(owner), 2)) * ~is_post[owner, None]
     kinds = np.where(is_post, Kind.POLE, Kind.PLANT).astype(np.uint8)[owner]
-    turns = rng.uniform(0.0, np.pi, len(owner))
-    return Cells(
-        np.concatenate([cells.points, points]), np.concatenate([cells.headings, turns]),
-        np.concatenate([cells.kinds, kinds]), np.concatenate([cells.groups, first + owner]),
-    )  # fmt: skip
+    return Cells(points, rng.uniform(0.0, np.pi, len(owner)), kinds, first + owner)
+
+
+def join_cells(first: Cells, second: Cells) -> Cells:
+    """Put two sets of cells into one; their group numbers are kept."""
+    return Cells(*(
+        np.concatenate([getattr(first, f.name), getattr(second, f.name)]) for f in fields(Cells)
+    ))  # fmt: skip
 
 
 def build_pieces(cells: Cells, seed: int, *, leaf_density: float = 1.0) -> Mesh:

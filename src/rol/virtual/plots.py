@@ -14,7 +14,7 @@ STYLES = (
     {"color": "#E69F00", "linestyle": "-"},
     {"color": "#009E73", "linestyle": "--"},
 )
-BIN_M = 0.0438
+BIN_M, OFFSET_M = 0.0438, -0.31  # as `radar` has them
 GREYS = plt.get_cmap("gray_r", 12)  # few levels: noise in fine ones makes large files and shows no more
 
 
@@ -109,7 +109,7 @@ def draw_polar_pair(
     for ax, (title, codes) in zip(axes, scans.items(), strict=True):
         ax.imshow(
             codes, cmap=GREYS, aspect="auto", vmin=0, vmax=96, interpolation="antialiased",
-            extent=(-0.31, -0.31 + BIN_M * codes.shape[1], 360, 0),
+            extent=(OFFSET_M, OFFSET_M + BIN_M * codes.shape[1], 360, 0),
         )  # fmt: skip
         ax.set(title=title, xlim=(0, max_range), yticks=np.arange(0, 361, 90), ylabel="azimuth [deg]")
         ax.grid(False)

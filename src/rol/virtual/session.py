@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 LIDARS = ("velodyne_left", "velodyne_right")
 FIRST_COUNT, COUNT_STEP = 13, 14  # encoder counts of the radar's rows: 13, 27, ... 5599 of 5600
 WORLD_RADIUS_M = 180.0  # how far from the drive a world grown from a map reaches
+CLEAR_M = 3.0  # what the map does not show stays so far from where the car drives
 # Parts of a session that draw from generators of their own.
 DRESS, DRIVE, TRAFFIC, SCANS, SWEEPS, ODOMETRY, GPS, INS, SCAN, SWEEP = range(10)
 
@@ -80,9 +81,7 @@ class VirtualSession:
 
     def generator(self, part: int, index: int = 0) -> np.random.Generator:
         """Give the generator of one part of the session, such as one scan."""
-        return np.random.default_rng(
-            [self.settings.seed, self.settings.sessions[self.name].seed, part, index]
-        )
+        return _generator(self.settings, self.name, part, index)
 
     def scene_at(self, stamp_us: float, radius: float = 170.0) -> Scene:
         """Give the town with everything that moves within a radius [m] where it is at one time [us]."""
@@ -90,6 +89,10 @@ class VirtualSession:
         return self.scene.with_moving(
             self.traffic.meshes_at(self.ground, stamp_us, self.first_mover, middle, radius)
         )
+
+
+def _generator(settings: VirtualSettings, name: str, part: int, index: int = 0) -> np.random.Generator:
+    return np.random.default_rng([settings.seed, settings.sessions[name].seed, part, index])
 
 
 def build_session(settings: VirtualSettings, name: str) -> VirtualSession:
@@ -117,11 +120,7 @@ def build_session(settings: VirtualSettings, name: str) -> VirtualSession:
     from .settings import describe
 
     describe(settings, name)  # a clear error if there is no such session
-    own = settings.sessions[name]
-
-    def rng(part: int, index: int = 0) -> np.random.Generator:
-        return np.random.default_rng([settings.seed, own.seed, part, index])
-
+    own, rng = settings.sessions[name], partial(_generator, settings, name)
     given = load_route(settings, own) if settings.world == "route" else None
     n_scans = own.scans if given is None else len(given)
     scans, turns = logs.schedule_scans(own.first_stamp_us, n_scans, rng(SCANS))
@@ -214,11 +213,14 @@ def _find_route(
     from .route import interpolate_drive, park_vehicles, plan_encounters
 
     places = thin_points(poses[:, :2], 2.0)[0]
-    cells = _read_map(str(rall.find_real_root(settings.real_root) / rall.MAP_PATH))
-    cells = mapped.crop_cells(cells, places, WORLD_RADIUS_M)
-    unmapped = np.random.default_rng([settings.seed, 0, 98])  # placed by what is left that day
-    left = mapped.change_cells(cells, rng(DRESS), missing_share=own.changed_share)
-    left = mapped.add_unmapped(left, poses[:, :2], unmapped, share=settings.unmapped_share)
+    path = str(rall.find_real_root(settings.real_root) / rall.MAP_PATH)
+    whole, unmapped = _read_map(path, settings.seed, settings.unmapped_share)
+    cells = mapped.crop_cells(whole, places, WORLD_RADIUS_M)
+    lane = thin_points(poses[:, :2], 0.5)[0]
+    left = mapped.join_cells(
+        mapped.change_cells(cells, rng(DRESS), missing_share=own.changed_share),
+        mapped.crop_cells(unmapped, lane, WORLD_RADIUS_M, clear_m=CLEAR_M),
+    )
     drive = interpolate_drive(middles_us, poses)
     things = [
         mapped.build_ground(places, WORLD_RADIUS_M),
@@ -269,10 +271,7 @@ def build_twins(real_root: Path | str, seed: int = 1, margin_s: float = 30.0) ->
         "2019-01-10T14:37:26", len(stamps), seed, parked_share=0.15, vehicles=10, people=6, sweeps="none"
     )
     settings = VirtualSettings({name: own}, seed=seed, world="route", real_root=str(real_root))
-
-    def rng(part: int, index: int = 0) -> np.random.Generator:
-        return np.random.default_rng([settings.seed, own.seed, part, index])
-
+    rng = partial(_generator, settings, name)
     before, after = np.arange(-margin_s, -0.1, 0.25), np.arange(0.25, margin_s, 0.25)
     middles = stamps + turns // 2
     mean_mps = np.hypot(*(poses[-1] - poses[0])[:2]) / ((middles[-1] - middles[0]) * 1e-6)
@@ -298,11 +297,13 @@ def _flat(places: np.ndarray) -> np.ndarray:
 
 
 @lru_cache(maxsize=1)
-def _read_map(path: str) -> Cells:
+def _read_map(path: str, seed: int, unmapped_share: float) -> tuple[Cells, Cells]:
+    """The map, and what stands there without being on it: the same for all sessions of a world."""
     from .. import rall
-    from .mapped import classify_cells
+    from .mapped import classify_cells, draw_unmapped
 
-    return classify_cells(rall.load_map_points(path))
+    cells = classify_cells(rall.load_map_points(path))
+    return cells, draw_unmapped(cells, np.random.default_rng([seed, 0, 98]), share=unmapped_share)
 
 
 @lru_cache(maxsize=1)

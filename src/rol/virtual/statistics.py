@@ -21,7 +21,6 @@ ZERO_RANGES_M = (3.0, 28.0, 41.0, 80.0, 106.0, 145.0)
 NEAR_RANGES_M = (0.0, 0.86, 2.0, 3.0)
 PEAK_EDGES = (0, 110, 130, 133, 256)
 MEASURED_RANGE_RESOLUTION = 0.0438  # bins are named by bin * resolution here, as the measured figures are
-BEAM_AZIMUTHS = -2.0 * np.pi * (13 + 14 * np.arange(400)) / 5600
 QUIET_CODE = 30  # a piece of a row whose codes stay below this holds noise and little else
 FAR_BIN = 3000
 
@@ -299,12 +298,14 @@ def _mean_correlation(
     import cv2
 
     from ..radar import MEASURED_RANGE_OFFSET, polar_to_cartesian
+    from .radar_sensor import beam_azimuths
 
+    azimuths = beam_azimuths()
     width, pixel, found = 512, 0.25, []
     middle = (width - 1) / 2.0
     images = [
         polar_to_cartesian(
-            scan, BEAM_AZIMUTHS, range_resolution=MEASURED_RANGE_RESOLUTION, range_offset=MEASURED_RANGE_OFFSET,
+            scan, azimuths, range_resolution=MEASURED_RANGE_RESOLUTION, range_offset=MEASURED_RANGE_OFFSET,
             pixel_size=pixel, width=width, twist=None if twists is None else twists[i],
             doppler_seconds=doppler_seconds,
         )
@@ -425,11 +426,12 @@ def map_shares(
 
     from ..geometry import transform_points
     from ..radar import MEASURED_RANGE_OFFSET, k_strongest_peaks
+    from .radar_sensor import beam_azimuths
 
     tree, shares = cKDTree(map_points), []
     for scan, pose in zip(codes, poses, strict=True):
         peaks = k_strongest_peaks(
-            scan, BEAM_AZIMUTHS, k, min_code, max_range_m=max_range_m,
+            scan, beam_azimuths(), k, min_code, max_range_m=max_range_m,
             range_resolution=MEASURED_RANGE_RESOLUTION, range_offset=MEASURED_RANGE_OFFSET,
         )  # fmt: skip
         gaps = tree.query(transform_points(pose, peaks))[0]

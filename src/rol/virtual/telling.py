@@ -126,8 +126,12 @@ def give_aways(verdict: Verdict, real: np.ndarray, virtual: np.ndarray) -> dict[
         "range": area under the curve of patches by range "low-high" [m]; "brightest": by the brightest code
         in the patch. 0.5 where it cannot tell.
     """
+    from .statistics import MEASURED_RANGE_RESOLUTION
+
     peaks = np.stack([cut_patches(real), cut_patches(virtual)]).max(axis=(-1, -2))
-    range_m = np.broadcast_to((np.arange(peaks.shape[3]) + 0.5) * BINS * 0.0438, peaks.shape)
+    range_m = np.broadcast_to(
+        (np.arange(peaks.shape[3]) + 0.5) * BINS * MEASURED_RANGE_RESOLUTION, peaks.shape
+    )
     found: dict[str, dict[str, float]] = {}
     cases = (
         ("range", range_m, (0, 3, 10, 25, 50, 80, 110, 170)),
