@@ -12,11 +12,12 @@ from safetensors.torch import save_file
 from torch import nn
 
 from rol.pix2pix import (
-    ARCHITECTURE,
+    ARCHITECTURES,
     Pix2PixError,
     TrainConfig,
     build_discriminator,
     build_generator,
+    entropy_loss,
     evaluate_l1,
     gan_loss,
     generate,
@@ -29,6 +30,7 @@ from rol.pix2pix import (
     to_tensor,
     train_step,
 )
+from rol.unet import fuse
 
 pytestmark = pytest.mark.torch
 TINY = TrainConfig(filters=2, blocks=1, discriminator_filters=2)
@@ -51,6 +53,29 @@ def count(network: nn.Module) -> int:
 
 
 # ---- networks
+
+
+def test_fused_u_net_gives_the_same_images() -> None:
+    network = build_generator(4, 1, "unet", rng=seeded())
+    images = torch.rand(4, 1, 64, 96, generator=seeded(2)) * 2.0 - 1.0
+    for _ in range(3):
+        network.logits(images)  # moves the running statistics
+    with torch.inference_mode():
+        before = network.eval()(images)
+        np.testing.assert_allclose(fuse(network)(images), before, atol=2e-5)
+    assert before.shape == images.shape and float(before.std()) > 0.0
+    assert not any(isinstance(part, nn.BatchNorm2d) for part in network.modules())
+
+
+def test_half_precision_weights_come_back_as_single(tmp_path: Path) -> None:
+    generator = tiny_generator()
+    save_weights(tmp_path / "g.safetensors", generator, half=True)
+    assert (tmp_path / "g.safetensors").stat().st_size < 4 * count(generator)
+    for back, weight in zip(
+        load_weights(tmp_path / "g.safetensors").parameters(), generator.parameters(), strict=True
+    ):
+        assert back.dtype == torch.float32
+        torch.testing.assert_close(back, weight, rtol=1e-3, atol=1e-6)
 
 
 def test_full_networks_have_the_size_of_the_public_ones() -> None:
@@ -125,7 +150,7 @@ def literal_step(generator, discriminator, adam_g, adam_d, radar, lidar, config)
     output = generator(radar)
     judged = discriminator(torch.cat([radar, output], 1))
     adam_g.zero_grad()
-    difference = (output - lidar).abs() * torch.where(lidar > 0, config.l1_occupied_weight, 1.0)
+    difference = (output - lidar).abs() * torch.where(lidar > 0, config.occupied_weight, 1.0)
     (bce(judged, torch.ones_like(judged)) + config.lambda_l1 * difference.mean()).backward()
     adam_g.step()
 
@@ -134,7 +159,7 @@ def optimizers(*networks: nn.Module) -> list[torch.optim.Optimizer]:
     return [torch.optim.Adam(network.parameters(), 2e-4, (0.5, 0.999)) for network in networks]
 
 
-@pytest.mark.parametrize("config", [TINY, TrainConfig(lambda_l1=7.0, l1_occupied_weight=3.0)])
+@pytest.mark.parametrize("config", [TINY, TrainConfig(lambda_l1=7.0, occupied_weight=3.0)])
 def test_step_updates_the_discriminator_first_and_then_the_generator(config: TrainConfig) -> None:
     networks = tiny_generator(), build_discriminator(2, rng=seeded(2))
     radar, lidar = torch.rand(2, 1, 1, 32, 32, generator=seeded(3)) * 2 - 1
@@ -152,7 +177,7 @@ def test_step_reports_plain_losses() -> None:
     networks = tiny_generator(), build_discriminator(2, rng=seeded(2))
     radar, lidar = torch.rand(2, 1, 1, 32, 32, generator=seeded(3)) * 2 - 1
     expected = float(l1_loss(networks[0](radar), lidar).detach())
-    losses = train_step(*networks, *optimizers(*networks), radar, lidar, TrainConfig(l1_occupied_weight=5.0))
+    losses = train_step(*networks, *optimizers(*networks), radar, lidar, TrainConfig(occupied_weight=5.0))
     assert set(losses) == {"loss_d", "loss_gan", "loss_l1"}
     assert losses["loss_l1"] == pytest.approx(expected)
 
@@ -192,7 +217,7 @@ def test_held_out_l1_is_the_mean_over_pairs() -> None:
 class Same(nn.Module):
     """A network that gives its input back."""
 
-    image_size = None
+    image_size, size_step = None, 4
 
     def __init__(self) -> None:
         super().__init__()
@@ -200,6 +225,20 @@ class Same(nn.Module):
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         return x
+
+
+def test_entropy_is_least_at_the_probability() -> None:
+    lidar = torch.tensor([1.0] * 3 + [-1.0] * 7).reshape(1, 1, 1, 10)
+    for weight in (1.0, 4.0):
+        p = weight * 0.3 / (1.0 + (weight - 1.0) * 0.3)
+        losses = [
+            float(entropy_loss(torch.full_like(lidar, 0.5 * math.log(q / (1.0 - q))), lidar, weight))
+            for q in (p - 0.02, p, p + 0.02)
+        ]
+        assert losses[1] < min(losses[0], losses[2])
+    p = torch.tanh(torch.tensor(0.3)) * 0.5 + 0.5  # grey as a probability
+    loss = entropy_loss(torch.full((1, 1, 2, 2), 0.3), torch.ones(1, 1, 2, 2))
+    assert float(loss) == pytest.approx(-math.log(p), rel=1e-5)
 
 
 def test_value_range_goes_there_and_back_for_every_grey_value() -> None:
@@ -261,7 +300,7 @@ def test_weights_come_back_with_what_they_are(weights: Path) -> None:
     )
     about = load_metadata(weights)
     assert about["seed"] == 1 and about["config"] == {"steps": 3}
-    assert about["architecture"] == ARCHITECTURE and about["torch"] == torch.__version__
+    assert about["architecture"] == ARCHITECTURES["resnet"] and about["torch"] == torch.__version__
 
 
 def test_trained_generator_refuses_images_of_another_size(weights: Path) -> None:
@@ -303,7 +342,7 @@ def test_weights_of_others_are_refused(tmp_path: Path) -> None:
 
 def test_header_that_promises_another_network_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "wrong.safetensors"
-    about = {"architecture": ARCHITECTURE, "filters": 4, "blocks": 1, "image_size": None}
+    about = {"architecture": ARCHITECTURES["resnet"], "filters": 4, "blocks": 1, "image_size": None}
     save_tensors(path, dict(tiny_generator().state_dict()), about)
     with pytest.raises(Pix2PixError, match="wrong.safetensors: tensors do not fit"):
         load_weights(path)

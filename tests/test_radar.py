@@ -8,6 +8,7 @@ import pytest
 
 from rol import radar
 from rol.radar import (
+    cfar_peaks,
     doppler_shift,
     find_peaks,
     k_strongest_peaks,
@@ -175,6 +176,32 @@ def test_find_peaks_by_hand():
     rows, bins = find_peaks(codes, k=9, min_code=60, min_bin=1)
     assert list(zip(rows, bins, strict=True)) == [(0, 2), (0, 5), (0, 8)]
     assert len(find_peaks(np.zeros((3, 5), dtype=np.uint8))[0]) == 0
+
+
+def test_cfar_by_hand():
+    codes = np.full((2, 60), 20, dtype=np.uint8)  # 10 dB everywhere
+    codes[0, 30] = 20 + 24 + 1  # 12.5 dB above it
+    codes[1, 20:23] = (60, 80, 60)  # one echo of three bins; the guard keeps it out of its own floor
+    codes[1, 55] = 43  # 11.5 dB above: not enough
+    rows, bins = cfar_peaks(codes, guard_bins=2, train_bins=6, threshold_db=12.0)
+    assert list(zip(rows, bins, strict=True)) == [(0, 30), (1, 21)]
+    assert len(cfar_peaks(codes, guard_bins=2, train_bins=6, threshold_db=12.0, min_bin=31)[0]) == 0
+    louder = np.minimum(codes.astype(int) + 100, 255).astype(np.uint8)  # only the contrast counts
+    np.testing.assert_array_equal(cfar_peaks(louder, guard_bins=2, train_bins=6), (rows, bins))
+    with pytest.raises(ValueError, match="do not fit"):
+        cfar_peaks(codes, guard_bins=20, train_bins=20)
+
+
+def test_cfar_against_a_literal_loop():
+    codes = np.random.default_rng(5).integers(0, 140, (3, 50)).astype(np.uint8)
+    power, found = 10.0 ** (codes / 20.0), []
+    for row, bin_ in np.ndindex(codes.shape):
+        cells = [power[row, b] for b in range(50) if 3 <= abs(b - bin_) <= 7]
+        left, right = (int(codes[row, b]) if 0 <= b < 50 else -1 for b in (bin_ - 1, bin_ + 1))
+        if power[row, bin_] > 4.0 * np.mean(cells) and left < codes[row, bin_] >= right:
+            found.append((row, bin_))
+    rows, bins = cfar_peaks(codes, guard_bins=2, train_bins=5, threshold_db=10.0 * np.log10(4.0))
+    assert list(zip(rows.tolist(), bins.tolist(), strict=True)) == found and len(found) > 5
 
 
 def test_peaks_become_points():

@@ -9,7 +9,7 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
-from rol.pix2pix import TrainConfig, load_metadata, load_weights
+from rol.pix2pix import TrainConfig, generate, load_metadata, load_weights
 from rol.training import TrainingError, learning_rate, pick_pairs, train
 
 pytestmark = pytest.mark.torch
@@ -142,10 +142,63 @@ def test_loss_that_is_not_finite_names_the_step_and_leaves_the_checkpoint(tmp_pa
     pairs = make_pairs(12)
     spoilt = int(pick_pairs(6, 12, 1, seed=1)[0])
     pairs[spoilt] = (np.full_like(pairs[spoilt][0], np.nan), pairs[spoilt][1])
-    with pytest.raises(TrainingError, match="step 7 of 12: discriminator loss is nan"):
+    told = (
+        f"step 7 of 12, batch of pair {spoilt}: discriminator loss is nan; .*last.safetensors stays as it is"
+    )
+    with pytest.raises(TrainingError, match=told):
         train(pairs, TINY, tmp_path, seed=1)
     assert load_metadata(tmp_path / "checkpoint" / "last.safetensors")["step"] == 4
     assert not (tmp_path / "generator.safetensors").exists()
+
+
+class Turnable(list):
+    """Pairs that can be turned by quarters, and have names."""
+
+    def draw(self, index: int, turn: float) -> tuple[np.ndarray, np.ndarray]:
+        quarters = round(turn / (0.5 * np.pi))
+        return tuple(np.ascontiguousarray(np.rot90(image, quarters, (1, 2))) for image in self[index])
+
+    def name(self, index: int) -> str:
+        return f"scan-{index}.png"
+
+
+def test_turned_pairs_are_drawn_from_seed_and_step_alone(tmp_path: Path) -> None:
+    config, pairs = replace(TINY, rotate=True, batch=2, gan_weight=0.0), Turnable(make_pairs(6))
+    whole = train(pairs, config, tmp_path / "whole", seed=1, loaders=3)[1]
+    plain = train(pairs, replace(config, rotate=False), tmp_path / "plain", seed=1)[1]
+    assert not np.allclose(whole["loss_l1"], plain["loss_l1"])
+    assert whole["loss_gan"].isna().all() and "discriminator" not in str(
+        load_metadata(tmp_path / "whole" / "generator.safetensors")
+    ).replace("discriminator_filters", "")
+
+    def stop(row: dict, generator: object) -> None:
+        if row["step"] == 6:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        train(pairs, config, tmp_path / "again", seed=1, on_report=stop)
+    again = train(pairs, config, tmp_path / "again", seed=1)[1]
+    pd.testing.assert_frame_equal(whole, again, check_exact=True)
+
+
+def test_files_of_a_batch_are_named_when_a_gradient_is_not_finite(tmp_path: Path) -> None:
+    pairs = Turnable(make_pairs(3))
+    pairs[1] = (np.full_like(pairs[1][0], np.inf), pairs[1][1])
+    with pytest.raises(TrainingError, match=r"batch of scan-1.png: .* there is no checkpoint yet"):
+        train(pairs, replace(TINY, gan_weight=0.0), tmp_path, seed=1)
+
+
+def test_small_u_net_learns_and_comes_back_from_its_file(tmp_path: Path) -> None:
+    config = TrainConfig(
+        network="unet", filters=4, blocks=1, gan_weight=0.0, pixel_loss="entropy", lambda_l1=1.0
+    )
+    config = replace(config, steps=40, batch=2, learning_rate=5e-3, report_every=20, checkpoint_every=40)
+    pairs = make_pairs(8, 64)
+    generator, history = train(pairs, config, tmp_path, seed=1, held_out=pairs[:2])
+    assert history["loss_l1"].iloc[-1] < 0.9 * history["loss_l1"].iloc[0]
+    image = np.rint((pairs[0][0][0] + 1.0) * 127.5).astype(np.uint8)
+    from_file = load_weights(tmp_path / "generator.safetensors")
+    np.testing.assert_array_equal(generate(from_file, image), generate(generator, image))
 
 
 @pytest.mark.parametrize(
@@ -155,6 +208,10 @@ def test_loss_that_is_not_finite_names_the_step_and_leaves_the_checkpoint(tmp_pa
         (make_pairs(1), replace(TINY, checkpoint_every=5, report_every=2), "no multiple"),
         (make_pairs(1), replace(TINY, batch=0), "at least 1"),
         (make_pairs(1, size=30), TINY, "multiples of 4"),
+        (make_pairs(1, size=48), replace(TINY, network="unet"), "multiples of 32"),
+        (make_pairs(1), replace(TINY, network="vnet"), "'vnet' is none of resnet, unet"),
+        (make_pairs(1), replace(TINY, pixel_loss="l2"), "pixel_loss must be"),
+        (make_pairs(1), replace(TINY, rotate=True), "rotate needs pairs that can be turned"),
     ],
 )
 def test_runs_that_cannot_be_are_refused(

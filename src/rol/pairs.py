@@ -459,6 +459,10 @@ class PairDataset:
     def __len__(self) -> int:
         return len(self.stamps_us)
 
+    def name(self, index: int) -> str:
+        """Name the radar image of a pair."""
+        return str(_image_path(self.folder, "radar", self.stamps_us[index]))
+
     def __getitem__(self, index: int) -> tuple[np.ndarray, np.ndarray]:
         """Give radar and lidar image, float32 (1, h, w), -1 for code 0 and +1 for code 255."""
         images = load_pair(self.folder, self.stamps_us[index])

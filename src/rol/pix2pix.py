@@ -15,10 +15,10 @@ from __future__ import annotations
 
 import json
 import os
-from contextlib import nullcontext
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -27,7 +27,13 @@ from safetensors.torch import save_file
 from torch import Tensor, nn
 from torch.nn import functional
 
-ARCHITECTURE = "resnet-generator, batch statistics, 1 to 1 channel"
+if TYPE_CHECKING:
+    from .unet import UnetGenerator
+
+ARCHITECTURES = {
+    "resnet": "resnet-generator, batch statistics, 1 to 1 channel",
+    "unet": "folded u-net, running statistics, 1 to 1 channel",
+}
 
 
 class Pix2PixError(ValueError):
@@ -38,6 +44,7 @@ class Pix2PixError(ValueError):
 class TrainConfig:
     """Settings of one training run; the defaults are the paper's, or the public code's where it is silent."""
 
+    network: str = "resnet"  # the paper's; "unet": `rol.unet`, smaller and quicker
     filters: int = 64  # width of the generator's first layer; public default
     blocks: int = 9  # residual blocks; Sec. IV-A, "ResNet with 9 blocks"
     discriminator_filters: int = 64  # width of the discriminator's first layer; public default
@@ -47,7 +54,12 @@ class TrainConfig:
     )
     batch: int = 1  # public default; batch statistics are then those of one image, as in use
     lambda_l1: float = 100.0  # lambda of Eq. 2; the paper gives no value, public default
-    l1_occupied_weight: float = 1.0  # 1: Eq. 4 as printed; above 1, L1 counts occupied pixels so many times
+    gan_weight: float = 1.0  # of Eq. 3 in Eq. 2; 0: no discriminator, the pixels' loss alone
+    pixel_loss: str = (
+        "l1"  # "l1": Eq. 4; "entropy": how surprised the image is, as if grey were a probability
+    )
+    occupied_weight: float = 1.0  # 1: Eq. 4 as printed; above 1, an occupied pixel counts so many times
+    rotate: bool = False  # True: every pair in a heading drawn anew; the paper does not
     learning_rate: float = 2e-4  # Adam; public default
     beta1: float = (
         0.5  # Adam; public default, lower than Adam's own 0.9 because the two losses chase each other
@@ -95,12 +107,10 @@ class ResnetGenerator(nn.Module):
         Height and width it was trained on; ``generate`` refuses any other. None: not trained yet.
     """
 
+    size_step = 4  # height and width must be multiples of it
+
     def __init__(self, filters: int, blocks: int) -> None:
         super().__init__()
-        if filters < 1 or blocks < 0:
-            raise Pix2PixError(
-                f"generator: filters must be at least 1 and blocks at least 0, got {filters}, {blocks}"
-            )
         self.filters, self.blocks, self.image_size = filters, blocks, None
         f = filters
         layers: list[nn.Module] = [
@@ -118,9 +128,13 @@ class ResnetGenerator(nn.Module):
         layers += [nn.ReflectionPad2d(3), nn.Conv2d(f, 1, 7), nn.Tanh()]
         self.layers = nn.Sequential(*layers)
 
+    def logits(self, radar: Tensor) -> Tensor:
+        """Map radar images to fake lidar images before the tanh: half the log-odds of an occupied pixel."""
+        return self.layers[:-1](radar).float()  # (b, 1, h, w) -> (b, 1, h, w)
+
     def forward(self, radar: Tensor) -> Tensor:
         """Map radar images to fake lidar images."""
-        return self.layers(radar)  # (b, 1, h, w) -> (b, 1, h, w)
+        return torch.tanh(self.logits(radar))  # (b, 1, h, w) -> (b, 1, h, w)
 
 
 def _initialise(network: nn.Module, rng: torch.Generator) -> nn.Module:
@@ -132,10 +146,14 @@ def _initialise(network: nn.Module, rng: torch.Generator) -> nn.Module:
             nn.init.normal_(module.weight, mean, 0.02, generator=rng)
             if module.bias is not None:
                 nn.init.zeros_(module.bias)
+            if isinstance(module, nn.BatchNorm2d):
+                module.reset_running_stats()
     return network.to(memory_format=torch.channels_last)  # about a fifth quicker on a CPU
 
 
-def build_generator(filters: int = 64, blocks: int = 9, *, rng: torch.Generator) -> ResnetGenerator:
+def build_generator(
+    filters: int = 64, blocks: int = 9, network: str = "resnet", *, rng: torch.Generator
+) -> ResnetGenerator | UnetGenerator:
     """Build the generator with freshly drawn weights.
 
     Parameters
@@ -144,17 +162,34 @@ def build_generator(filters: int = 64, blocks: int = 9, *, rng: torch.Generator)
         Width of the first layer; 64 is the paper's, the cost grows with its square.
     blocks : int
         Residual blocks; 9 in the paper.
+    network : str
+        "resnet", the paper's, or "unet", see `rol.unet`.
     rng : torch.Generator
         Source of the weights, N(0, 0.02) as in pix2pix.
 
     Returns
     -------
-    generator : ResnetGenerator
-        Maps (b, 1, h, w) to (b, 1, h, w), both in [-1, 1]; h and w must be multiples of 4.
+    generator : ResnetGenerator or UnetGenerator
+        Maps (b, 1, h, w) to (b, 1, h, w), both in [-1, 1]; h and w must be multiples of its `size_step`.
+
+    Raises
+    ------
+    Pix2PixError
+        If there is no such network, or not of this width and depth.
     """
+    if network not in ARCHITECTURES:
+        raise Pix2PixError(f"network: {network!r} is none of {', '.join(ARCHITECTURES)}")
+    if filters < 1 or blocks < 0:
+        raise Pix2PixError(
+            f"generator: filters must be at least 1 and blocks at least 0, got {filters}, {blocks}"
+        )
+    if network == "unet":
+        from .unet import UnetGenerator as Network
+    else:
+        Network = ResnetGenerator
     with torch.device("meta"):  # no weights drawn from torch's global state
-        network = ResnetGenerator(filters, blocks)
-    return _initialise(network, rng)
+        built = Network(filters, blocks)
+    return _initialise(built, rng)
 
 
 def build_discriminator(filters: int = 64, *, rng: torch.Generator) -> nn.Sequential:
@@ -237,17 +272,47 @@ def l1_loss(fake: Tensor, lidar: Tensor, occupied_weight: float = 1.0) -> Tensor
     loss : tensor, shape ()
         Mean over all pixels; in [0, 2] for a weight of 1.
     """
-    difference = (fake - lidar).abs()
+    return _weigh((fake - lidar).abs(), lidar, occupied_weight)
+
+
+def entropy_loss(logits: Tensor, lidar: Tensor, occupied_weight: float = 1.0) -> Tensor:
+    """Measure how surprising the real image is if the generated grey is a probability: cross-entropy.
+
+    Unlike Eq. 4 it has a slope where the generator is sure and wrong, and its least value is reached by the
+    true probability p of an occupied pixel, or w p / (1 + (w - 1) p) for a weight w. Not in the paper.
+
+    Parameters
+    ----------
+    logits : tensor, shape (b, 1, h, w)
+        Output of `ResnetGenerator.logits`; the image is their tanh, so the log-odds are twice the logits.
+    lidar : tensor, shape (b, 1, h, w)
+        Real image in [-1, 1].
+    occupied_weight : float
+        How many times a pixel counts that is occupied in the real image.
+
+    Returns
+    -------
+    loss : tensor, shape ()
+        Mean over all pixels [nat].
+    """
+    surprise = functional.binary_cross_entropy_with_logits(
+        2.0 * logits, (lidar > 0).to(logits.dtype), reduction="none"
+    )
+    return _weigh(surprise, lidar, occupied_weight)
+
+
+def _weigh(losses: Tensor, lidar: Tensor, occupied_weight: float) -> Tensor:
+    """Mean of losses by pixel, those of occupied pixels counted so many times."""
     if occupied_weight != 1.0:
-        difference = difference * (1.0 + (occupied_weight - 1.0) * (lidar > 0))
-    return difference.mean()
+        losses = losses * (1.0 + (occupied_weight - 1.0) * (lidar > 0))
+    return losses.mean()
 
 
 def train_step(
-    generator: nn.Module,
-    discriminator: nn.Module,
+    generator: ResnetGenerator | UnetGenerator,
+    discriminator: nn.Module | None,
     optimizer_g: torch.optim.Optimizer,
-    optimizer_d: torch.optim.Optimizer,
+    optimizer_d: torch.optim.Optimizer | None,
     radar: Tensor,
     lidar: Tensor,
     config: TrainConfig,
@@ -257,24 +322,24 @@ def train_step(
     Parameters
     ----------
     generator, discriminator : torch.nn.Module
-        The two networks.
+        The two networks; no discriminator is needed where `config.gan_weight` is 0.
     optimizer_g, optimizer_d : torch.optim.Optimizer
         Their optimisers.
     radar, lidar : tensor, shape (b, 1, h, w)
         A batch of pairs in [-1, 1].
     config : TrainConfig
-        Read: `lambda_l1`, `l1_occupied_weight`, `bf16`.
+        Read: `gan_weight`, `pixel_loss`, `lambda_l1`, `occupied_weight`, `bf16`.
 
     Returns
     -------
     losses : dict of float
-        ``loss_d`` (half the sum of its two terms), ``loss_gan``, ``loss_l1`` (Eq. 4, without lambda and
-        weight).
+        ``loss_d`` (half the sum of its two terms), ``loss_gan``, both nan without a discriminator, and
+        ``loss_l1`` (Eq. 4, without lambda and weight).
 
     Raises
     ------
     Pix2PixError
-        If a loss is not finite; the weights are then not updated by it.
+        If a loss or a gradient is not finite; the weights are then not updated by it.
 
     Notes
     -----
@@ -283,39 +348,58 @@ def train_step(
     """
     autocast = torch.autocast(radar.device.type, torch.bfloat16) if config.bf16 else nullcontext()
     with autocast:
-        fake = generator(radar)  # (b, 1, h, w)
-
-        discriminator.requires_grad_(True)
-        loss_fake = gan_loss(discriminator(torch.cat([radar, fake.detach()], 1)).float(), False)
-        loss_real = gan_loss(discriminator(torch.cat([radar, lidar], 1)).float(), True)
-        loss_d = 0.5 * (loss_fake + loss_real)  # halved as in pix2pix: D learns more slowly than G
-    _descend(optimizer_d, loss_d, "discriminator loss")
-
-    discriminator.requires_grad_(False)
-    with autocast:
-        loss_gan = gan_loss(discriminator(torch.cat([radar, fake], 1)).float(), True)
-    fake = fake.float()
-    weighted = l1_loss(fake, lidar, config.l1_occupied_weight)
-    _descend(optimizer_g, loss_gan + config.lambda_l1 * weighted, "generator loss")
+        logits = generator.logits(radar)  # (b, 1, h, w)
+        fake = torch.tanh(logits)
+    loss_d, loss_gan = torch.tensor(float("nan")), torch.tensor(float("nan"))
+    if discriminator is not None and optimizer_d is not None and config.gan_weight > 0.0:
+        loss_d = _discriminator_loss(
+            discriminator.requires_grad_(True), radar, lidar, fake.detach(), autocast
+        )
+        _descend(optimizer_d, loss_d, "discriminator loss")
+        discriminator.requires_grad_(False)
+        with autocast:
+            loss_gan = gan_loss(discriminator(torch.cat([radar, fake], 1)).float(), True)
+    weight = config.occupied_weight
+    if config.pixel_loss == "entropy":
+        loss_g = config.lambda_l1 * entropy_loss(logits, lidar, weight)
+    else:
+        loss_g = config.lambda_l1 * l1_loss(fake, lidar, weight)
+    if config.gan_weight > 0.0:
+        loss_g = loss_g + config.gan_weight * loss_gan
+    _descend(optimizer_g, loss_g, "generator loss")
     losses = {"loss_d": loss_d, "loss_gan": loss_gan, "loss_l1": l1_loss(fake, lidar)}
     return {name: float(loss.detach()) for name, loss in losses.items()}
 
 
+def _discriminator_loss(
+    discriminator: nn.Module, radar: Tensor, lidar: Tensor, fake: Tensor, autocast: AbstractContextManager
+) -> Tensor:
+    """Eq. 3 for the discriminator, halved as in pix2pix: it learns more slowly than the generator."""
+    with autocast:
+        loss_fake = gan_loss(discriminator(torch.cat([radar, fake], 1)).float(), False)
+        loss_real = gan_loss(discriminator(torch.cat([radar, lidar], 1)).float(), True)
+    return 0.5 * (loss_fake + loss_real)
+
+
 def _descend(optimizer: torch.optim.Optimizer, loss: Tensor, name: str) -> None:
-    """Take one optimiser step down a loss, or refuse if the loss is not finite."""
+    """Take one optimiser step down a loss, or refuse if the loss or a gradient is not finite."""
     if not torch.isfinite(loss.detach()):
         raise Pix2PixError(f"{name} is {float(loss.detach())}")
     optimizer.zero_grad(set_to_none=True)
     loss.backward()
+    weights = [weight for group in optimizer.param_groups for weight in group["params"]]
+    steepness = torch.nn.utils.get_total_norm([w.grad for w in weights if w.grad is not None])
+    if not torch.isfinite(steepness):
+        raise Pix2PixError(f"gradient of the {name} is {float(steepness)}")
     optimizer.step()
 
 
-def evaluate_l1(generator: ResnetGenerator, pairs: Any) -> float:
+def evaluate_l1(generator: ResnetGenerator | UnetGenerator, pairs: Any) -> float:
     """Measure Eq. 4 on pairs that are not learnt from.
 
     Parameters
     ----------
-    generator : ResnetGenerator
+    generator : ResnetGenerator or UnetGenerator
         The network.
     pairs : sequence of (radar, lidar), each array float32 (1, h, w) in [-1, 1]
         The pairs.
@@ -325,11 +409,13 @@ def evaluate_l1(generator: ResnetGenerator, pairs: Any) -> float:
     l1 : float
         Mean absolute difference in [0, 2]; nan without pairs.
     """
-    device, losses = next(generator.parameters()).device, []
+    device, losses, was_training = next(generator.parameters()).device, [], generator.training
+    generator.eval()
     with torch.inference_mode():
         for index in range(len(pairs)):
             radar, lidar = (torch.from_numpy(image[None]).to(device) for image in pairs[index])
             losses.append(float(l1_loss(generator(radar), lidar)))
+    generator.train(was_training)
     return float(np.mean(losses)) if losses else float("nan")
 
 
@@ -349,7 +435,9 @@ def to_tensor(image: np.ndarray) -> Tensor:
     return torch.from_numpy(image[None, None].astype(np.float32) / np.float32(127.5) - np.float32(1.0))
 
 
-def generate(generator: ResnetGenerator, radar_image: np.ndarray, *, bf16: bool = False) -> np.ndarray:
+def generate(
+    generator: ResnetGenerator | UnetGenerator, radar_image: np.ndarray, *, bf16: bool = False
+) -> np.ndarray:
     """Turn a radar image into a fake lidar image.
 
     The same network gives the same image whether it is in training or evaluation mode: batch norm takes the
@@ -357,7 +445,7 @@ def generate(generator: ResnetGenerator, radar_image: np.ndarray, *, bf16: bool 
 
     Parameters
     ----------
-    generator : ResnetGenerator
+    generator : ResnetGenerator or UnetGenerator
         The trained network.
     radar_image : array, shape (h, w), uint8
         Power image of one scan; h and w multiples of 4, and those the network was trained on.
@@ -380,7 +468,7 @@ def generate(generator: ResnetGenerator, radar_image: np.ndarray, *, bf16: bool 
     """
     if radar_image.dtype != np.uint8 or radar_image.ndim != 2:
         raise Pix2PixError(f"radar image: expected uint8 (h, w), got {radar_image.dtype} {radar_image.shape}")
-    check_size(radar_image.shape, generator.image_size, "radar image")
+    check_size(radar_image.shape, generator.image_size, "radar image", generator.size_step)
     device = next(generator.parameters()).device
     autocast = torch.autocast(device.type, torch.bfloat16) if bf16 else nullcontext()
     with torch.inference_mode(), autocast:
@@ -388,16 +476,22 @@ def generate(generator: ResnetGenerator, radar_image: np.ndarray, *, bf16: bool 
     return torch.round((fake.float() + 1.0) * 127.5).to(torch.uint8).cpu().numpy()
 
 
-def check_size(size: tuple[int, ...], expected: tuple[int, int] | None, name: str) -> None:
+def check_size(size: tuple[int, ...], expected: tuple[int, int] | None, name: str, step: int = 4) -> None:
     """Refuse image sizes the network cannot give back, or was not trained on."""
-    if any(n % 4 or n < 16 for n in size):
-        raise Pix2PixError(f"{name}: height and width must be multiples of 4 from 16 on, got {tuple(size)}")
+    if any(n % step or n < max(step, 16) for n in size):
+        raise Pix2PixError(
+            f"{name}: height and width must be multiples of {step} from {max(step, 16)} on, got {tuple(size)}"
+        )
     if expected is not None and tuple(size) != tuple(expected):
         raise Pix2PixError(f"{name}: size {tuple(size)}, but the generator was trained on {tuple(expected)}")
 
 
 def save_weights(
-    path: str | Path, generator: ResnetGenerator, metadata: dict[str, Any] | None = None
+    path: str | Path,
+    generator: ResnetGenerator | UnetGenerator,
+    metadata: dict[str, Any] | None = None,
+    *,
+    half: bool = False,
 ) -> None:
     """Write a generator with what is needed to build it again, atomically.
 
@@ -405,24 +499,27 @@ def save_weights(
     ----------
     path : path
         File to write, ``*.safetensors``.
-    generator : ResnetGenerator
+    generator : ResnetGenerator or UnetGenerator
         The network.
     metadata : dict, optional
         More to put into the header, JSON values only (seed, settings, session ...).
+    half : bool
+        Write float16, half the size; `load_weights` gives float32 again.
     """
     about = {
-        "architecture": ARCHITECTURE,
+        "architecture": ARCHITECTURES["resnet" if isinstance(generator, ResnetGenerator) else "unet"],
         "filters": generator.filters,
         "blocks": generator.blocks,
         "image_size": generator.image_size,
         "torch": str(torch.__version__),
     }
-    save_tensors(Path(path), dict(generator.state_dict()), {**(metadata or {}), **about})
+    tensors = {name: value.half() if half else value for name, value in generator.state_dict().items()}
+    save_tensors(Path(path), tensors, {**(metadata or {}), **about})
 
 
 def load_weights(
     path: str | Path, *, filters: int | None = None, blocks: int | None = None
-) -> ResnetGenerator:
+) -> ResnetGenerator | UnetGenerator:
     """Build a generator from a file of `save_weights`.
 
     Parameters
@@ -434,8 +531,8 @@ def load_weights(
 
     Returns
     -------
-    generator : ResnetGenerator
-        The network with its weights, on the CPU.
+    generator : ResnetGenerator or UnetGenerator
+        The network with its weights, on the CPU, in evaluation mode.
 
     Raises
     ------
@@ -444,18 +541,23 @@ def load_weights(
         that its header promises; the message names the file.
     """
     tensors, about = load_tensors(Path(path))
-    if about.get("architecture") != ARCHITECTURE:
-        raise Pix2PixError(f"{path}: architecture {about.get('architecture')!r}, expected {ARCHITECTURE!r}")
+    network = next(
+        (name for name, words in ARCHITECTURES.items() if words == about.get("architecture")), None
+    )
+    if network is None:
+        raise Pix2PixError(
+            f"{path}: architecture {about.get('architecture')!r}, known are {list(ARCHITECTURES.values())}"
+        )
     for name, wanted in (("filters", filters), ("blocks", blocks)):
         if wanted is not None and about[name] != wanted:
             raise Pix2PixError(f"{path}: generator with {about[name]} {name}, expected {wanted}")
-    generator = build_generator(about["filters"], about["blocks"], rng=torch.Generator())
+    generator = build_generator(about["filters"], about["blocks"], network, rng=torch.Generator())
     try:
         generator.load_state_dict(tensors)
     except RuntimeError as error:
         raise Pix2PixError(f"{path}: tensors do not fit the header's architecture ({error})") from error
     generator.image_size = None if about["image_size"] is None else tuple(about["image_size"])
-    return generator
+    return generator.eval()
 
 
 def load_metadata(path: str | Path) -> dict[str, Any]:

@@ -18,6 +18,7 @@ KIT_RANGE_RESOLUTION, KIT_RANGE_OFFSET = 0.0432, 0.0
 MEASURED_RANGE_RESOLUTION, MEASURED_RANGE_OFFSET = 0.0438, -0.31
 DOPPLER_SECONDS = 0.049  # a target ahead reads nearer by this time multiplied by the closing speed
 SCAN_SECONDS = 0.25  # one turn
+_CODE_POWER = 10.0 ** (np.arange(256) / 20.0)  # a code is half a decibel
 
 
 def polar_to_cartesian(
@@ -78,10 +79,11 @@ def polar_to_cartesian(
     half = (width - 1) / 2.0 * pixel_size
     axis = np.linspace(half, -half, width, dtype=np.float32)
     x, y = np.repeat(axis[:, None], width, axis=1), np.repeat(axis[None, :], width, axis=0)
-    first, step = -azimuths[0], azimuths[0] - azimuths[1]
+    first, step = np.mod(-azimuths[0], 2.0 * np.pi), azimuths[0] - azimuths[1]
     clockwise = np.arctan2(-y, x)
     np.add(clockwise, np.float32(2.0 * np.pi), out=clockwise, where=clockwise < 0.0)
     rows = (clockwise - np.float32(first)) / np.float32(step)
+    np.add(rows, np.float32(len(codes)), out=rows, where=rows < -1.0)  # scans that do not begin ahead
     if twist is None:
         ranges = np.sqrt(x * x + y * y)
     else:
@@ -222,6 +224,111 @@ def find_peaks(
     return rows[rank < k], bins[rank < k]
 
 
+def cfar_peaks(
+    codes: np.ndarray,
+    *,
+    guard_bins: int = 12,
+    train_bins: int = 40,
+    threshold_db: float = 12.0,
+    min_bin: int = 0,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Find local maxima along range that stand out from what surrounds them (cell-averaging CFAR).
+
+    Parameters
+    ----------
+    codes : array, shape (a, b)
+        Power codes in half decibels.
+    guard_bins, train_bins : int
+        Bins left out next to the cell on either side, and bins beyond them whose mean power is the floor.
+    threshold_db : float
+        How far above the floor a cell must be [dB].
+    min_bin : int
+        Nearest bin kept.
+
+    Returns
+    -------
+    rows, bins : array, shape (n,)
+        Indices of the detections, by row, near ones first.
+
+    Raises
+    ------
+    ValueError
+        If a width is not positive or a row is too short for the window.
+
+    Notes
+    -----
+    Cells at the ends of a row take the floor from the side they have. The floor is a mean of powers, not of
+    decibels, as in the classical detector.
+    """
+    codes, reach = np.asarray(codes), guard_bins + train_bins
+    if guard_bins < 0 or train_bins < 1 or codes.ndim != 2 or codes.shape[1] <= 2 * reach:
+        raise ValueError(
+            f"CFAR: guard {guard_bins} and train {train_bins} bins do not fit codes {codes.shape}"
+        )
+    sums = np.cumsum(_CODE_POWER[codes], axis=1, dtype=np.float64)
+    sums = np.concatenate([np.zeros((len(codes), 1)), sums], axis=1)
+    edges = np.clip(
+        np.arange(codes.shape[1])[:, None] + (-reach, -guard_bins, guard_bins + 1, reach + 1),
+        0,
+        codes.shape[1],
+    )
+    n_cells = (edges[:, 1] - edges[:, 0]) + (edges[:, 3] - edges[:, 2])
+    floor = (
+        sums[:, edges[:, 1]] - sums[:, edges[:, 0]] + sums[:, edges[:, 3]] - sums[:, edges[:, 2]]
+    ) / n_cells
+    found = _CODE_POWER[codes] > floor * 10.0 ** (threshold_db / 10.0)
+    found[:, 1:] &= codes[:, 1:] > codes[:, :-1]  # of a plateau the first bin counts
+    found[:, :-1] &= codes[:, :-1] >= codes[:, 1:]
+    found[:, :min_bin] = False
+    rows, bins = np.nonzero(found)
+    return rows, bins
+
+
+def peaks_to_points(
+    rows: np.ndarray,
+    bins: np.ndarray,
+    azimuths: np.ndarray,
+    *,
+    max_range_m: float = np.inf,
+    range_resolution: float = KIT_RANGE_RESOLUTION,
+    range_offset: float = KIT_RANGE_OFFSET,
+    twist: np.ndarray | tuple[float, float, float] | None = None,
+    scan_seconds: float = SCAN_SECONDS,
+    doppler_seconds: float = 0.0,
+) -> np.ndarray:
+    """Turn peaks of a polar scan into points.
+
+    Parameters
+    ----------
+    rows, bins : array, shape (n,)
+        Indices of the peaks.
+    azimuths : array, shape (a,)
+        Counter-clockwise bearings of all rows [rad].
+    max_range_m : float
+        Points farther away are dropped [m].
+    range_resolution, range_offset : float
+        Length of a bin and shift of all ranges [m].
+    twist : array-like, shape (3,), optional
+        Body velocity; with it the points are moved to mid-scan [m/s, m/s, rad/s].
+    scan_seconds, doppler_seconds : float
+        As in `polar_to_cartesian`; used with a twist [s].
+
+    Returns
+    -------
+    points : array, shape (n, 2)
+        Points in the radar frame [m].
+    """
+    ranges, bearings = (bins + 0.5) * range_resolution + range_offset, azimuths[rows]
+    if twist is not None:
+        ranges = ranges - doppler_shift(bearings, twist, doppler_seconds)
+    points = np.stack([ranges * np.cos(bearings), ranges * np.sin(bearings)], axis=1)[ranges <= max_range_m]
+    if twist is None:
+        return points
+    return undistort_points(
+        points, row_seconds(len(azimuths), scan_seconds)[rows[ranges <= max_range_m]], twist
+    )
+
+
 def k_strongest_peaks(
     codes: np.ndarray,
     azimuths: np.ndarray,
@@ -263,13 +370,10 @@ def k_strongest_peaks(
     codes, azimuths = _check_scan(codes, azimuths)
     min_bin = int(np.ceil((min_range_m - range_offset) / range_resolution - 0.5))
     rows, bins = find_peaks(codes, k, min_code, max(min_bin, 0))
-    ranges, bearings = (bins + 0.5) * range_resolution + range_offset, azimuths[rows]
-    if twist is not None:
-        ranges = ranges - doppler_shift(bearings, twist, doppler_seconds)
-    points = np.stack([ranges * np.cos(bearings), ranges * np.sin(bearings)], axis=1)[ranges <= max_range_m]
-    if twist is None:
-        return points
-    return undistort_points(points, row_seconds(len(codes), scan_seconds)[rows[ranges <= max_range_m]], twist)
+    return peaks_to_points(
+        rows, bins, azimuths, max_range_m=max_range_m, range_resolution=range_resolution, range_offset=range_offset,
+        twist=twist, scan_seconds=scan_seconds, doppler_seconds=doppler_seconds,
+    )  # fmt: skip
 
 
 def _check_scan(codes: np.ndarray, azimuths: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

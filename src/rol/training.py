@@ -8,7 +8,9 @@ from __future__ import annotations
 
 import os
 import zlib
-from collections.abc import Callable
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,7 +19,10 @@ import numpy as np
 import pandas as pd
 
 if TYPE_CHECKING:
+    from torch import Tensor
+
     from .pix2pix import ResnetGenerator, TrainConfig
+    from .unet import UnetGenerator
 
 HISTORY_COLUMNS = ["step", "epoch", "learning_rate", "loss_d", "loss_gan", "loss_l1", "held_out_l1"]
 
@@ -45,9 +50,11 @@ class TrainingState:
         from .pix2pix import build_discriminator, build_generator
 
         rng = torch.Generator().manual_seed(seed)
-        generator = build_generator(config.filters, config.blocks, rng=rng)
-        discriminator = build_discriminator(config.discriminator_filters, rng=rng)
-        self.networks = {"generator": generator.to(device), "discriminator": discriminator.to(device)}
+        self.networks = {"generator": build_generator(config.filters, config.blocks, config.network, rng=rng)}
+        self.networks["generator"].to(device)
+        if config.gan_weight > 0.0:
+            discriminator = build_discriminator(config.discriminator_filters, rng=rng)
+            self.networks["discriminator"] = discriminator.to(device)
         betas = (config.beta1, config.beta2)
         self.optimizers = {
             name: torch.optim.Adam(network.parameters(), config.learning_rate, betas)
@@ -140,8 +147,9 @@ def train(
     resume: bool = True,
     device: str = "cpu",
     metadata: dict[str, Any] | None = None,
-    on_report: Callable[[dict[str, float], ResnetGenerator], None] | None = None,
-) -> tuple[ResnetGenerator, pd.DataFrame]:
+    on_report: Callable[[dict[str, float], ResnetGenerator | UnetGenerator], None] | None = None,
+    loaders: int = 1,
+) -> tuple[ResnetGenerator | UnetGenerator, pd.DataFrame]:
     """Train both networks; stop at any time and call again to go on from the last checkpoint.
 
     On a CPU the same seed gives the same losses to the last bit, stopped or not, for one kind of processor
@@ -150,7 +158,9 @@ def train(
     Parameters
     ----------
     dataset, held_out : sequence of (radar, lidar), each array float32 (1, h, w) in [-1, 1]
-        Pairs to learn from, and pairs that are only looked at.
+        Pairs to learn from, and pairs that are only looked at. With `config.rotate` the former need a method
+        `draw(index, turn)`, see `rol.scan_pairs.ScanPairs`. Where it has a method `name(index)`, errors name
+        the files of a batch by it.
     config : TrainConfig
         The settings.
     out_dir : path
@@ -165,10 +175,12 @@ def train(
         More for the header of the weights file, JSON values only.
     on_report : callable, optional
         Called with each new row of the history and the generator, to print or to keep samples.
+    loaders : int
+        Threads that load pairs ahead.
 
     Returns
     -------
-    generator : ResnetGenerator
+    generator : ResnetGenerator or UnetGenerator
         The trained network.
     history : DataFrame
         One row per ``report_every`` steps: means of the losses over them, and Eq. 4 on the held-out pairs.
@@ -177,7 +189,7 @@ def train(
     ------
     TrainingError
         If there are no pairs, the settings contradict each other, the checkpoint is another run's, or a loss
-        is not finite.
+        or a gradient is not finite; then the message names the step, the batch's files and the checkpoint.
 
     Notes
     -----
@@ -194,7 +206,12 @@ def train(
     if resume and checkpoint.is_file():
         state.load(checkpoint, about)
     while state.step < n_steps:
-        row = _train_some(state, dataset, config, seed)
+        generator.train()
+        try:
+            row = _train_some(state, dataset, config, seed, loaders)
+        except TrainingError as error:
+            kept = f"{checkpoint} stays as it is" if checkpoint.is_file() else "there is no checkpoint yet"
+            raise TrainingError(f"{error}; {kept}") from error
         row["held_out_l1"] = evaluate_l1(generator, held_out)
         state.history.append(row)
         if on_report is not None:
@@ -208,39 +225,110 @@ def train(
     save_weights(
         folder / "generator.safetensors", generator, {**(metadata or {}), **about, "step": state.step}
     )
-    return generator, history
+    return generator.eval(), history
 
 
-def _train_some(state: TrainingState, dataset: Any, config: TrainConfig, seed: int) -> dict[str, float]:
+def score_points(
+    generator: ResnetGenerator | UnetGenerator,
+    pairs: Any,
+    thresholds: Sequence[int] = (128,),
+    *,
+    bf16: bool = False,
+) -> pd.DataFrame:
+    """Measure in metres how good a generator's points are, at several thresholds.
+
+    Parameters
+    ----------
+    generator : ResnetGenerator or UnetGenerator
+        The network.
+    pairs : sequence of (radar, lidar), each array float32 (1, h, w) in [-1, 1]
+        Pairs that it did not learn from.
+    thresholds : sequence of int
+        Smallest grey values that count as a point.
+    bf16 : bool
+        Multiply in bfloat16.
+
+    Returns
+    -------
+    scores : DataFrame
+        One row per threshold: its value, and the means over the pairs of what
+        `rol.similarity.similarity_summary` gives, spreads under the names ending in ``_sd``.
+
+    Notes
+    -----
+    Yin et al. 2020, Sec. IV-B.
+    """
+    from .bev import image_to_points
+    from .pix2pix import generate
+    from .similarity import similarity_summary
+
+    rows = []
+    for index in range(len(pairs)):
+        radar, lidar = (np.rint((image[0] + 1.0) * 127.5).astype(np.uint8) for image in pairs[index])
+        fake, real = generate(generator, radar, bf16=bf16), image_to_points(lidar)
+        rows += [
+            {"threshold": level, **similarity_summary(image_to_points(fake, threshold=level), real)}
+            for level in thresholds
+        ]
+    by_threshold = pd.DataFrame(rows).groupby("threshold")
+    return by_threshold.mean().join(by_threshold.std().add_suffix("_sd")).reset_index()
+
+
+def _train_some(
+    state: TrainingState, dataset: Any, config: TrainConfig, seed: int, loaders: int
+) -> dict[str, float]:
     """Take the steps of one row of the history and average their losses."""
-    import torch
-
     from .pix2pix import Pix2PixError, train_step
 
-    n_pairs, losses = len(dataset), []
-    n_steps, device = config.n_steps(n_pairs), next(state.networks["generator"].parameters()).device
-    for step in range(state.step, min(state.step + config.report_every, n_steps)):
+    n_steps, losses = config.n_steps(len(dataset)), []
+    device = next(state.networks["generator"].parameters()).device
+    steps = range(state.step, min(state.step + config.report_every, n_steps))
+    parts = [
+        both.get(name)
+        for both in (state.networks, state.optimizers)
+        for name in ("generator", "discriminator")
+    ]
+    for step, (radar, lidar) in zip(steps, _load_ahead(dataset, config, seed, steps, loaders), strict=True):
         rate = learning_rate(step, n_steps, config.learning_rate)
         for optimizer in state.optimizers.values():
             optimizer.param_groups[0]["lr"] = rate
-        pairs = [dataset[int(index)] for index in pick_pairs(step, n_pairs, config.batch, seed)]
-        radar, lidar = (torch.from_numpy(np.stack(side)).to(device) for side in zip(*pairs, strict=True))
         try:
-            losses.append(
-                train_step(*state.networks.values(), *state.optimizers.values(), radar, lidar, config)
-            )
+            losses.append(train_step(*parts, radar.to(device), lidar.to(device), config))
         except Pix2PixError as error:
-            raise TrainingError(
-                f"step {step + 1} of {n_steps}: {error}; checkpoints stay as they are"
-            ) from error
+            batch = pick_pairs(step, len(dataset), config.batch, seed)
+            names = ", ".join(
+                dataset.name(int(i)) if hasattr(dataset, "name") else f"pair {i}" for i in batch
+            )
+            raise TrainingError(f"step {step + 1} of {n_steps}, batch of {names}: {error}") from error
         state.step = step + 1
     means = {name: float(np.mean([loss[name] for loss in losses])) for name in losses[0]}
-    return {
-        "step": state.step,
-        "epoch": state.step / -(-n_pairs // config.batch),
-        "learning_rate": rate,
-        **means,
-    }
+    epoch = state.step / -(-len(dataset) // config.batch)
+    return {"step": state.step, "epoch": epoch, "learning_rate": rate, **means}
+
+
+def _load_ahead(
+    dataset: Any, config: TrainConfig, seed: int, steps: range, loaders: int
+) -> Iterator[tuple[Tensor, Tensor]]:
+    """Give the batches of some steps, each loaded while the one before is learnt from."""
+    import torch
+
+    def load(step: int) -> tuple[Tensor, Tensor]:
+        batch = pick_pairs(step, len(dataset), config.batch, seed)
+        turns = np.random.default_rng([seed, step, 1]).uniform(-np.pi, np.pi, len(batch))
+        pairs = [
+            dataset.draw(int(index), float(turn)) if config.rotate else dataset[int(index)]
+            for index, turn in zip(batch, turns, strict=True)
+        ]
+        radar, lidar = (torch.from_numpy(np.stack(side)) for side in zip(*pairs, strict=True))
+        return radar, lidar
+
+    with ThreadPoolExecutor(loaders) as pool:
+        waiting = deque(pool.submit(load, step) for step in steps[: loaders + 1])
+        for step in steps:
+            radar, lidar = waiting.popleft().result()
+            if step + loaders + 1 < steps.stop:
+                waiting.append(pool.submit(load, step + loaders + 1))
+            yield radar, lidar
 
 
 def _check_run(dataset: Any, config: TrainConfig) -> tuple[int, int]:
@@ -251,11 +339,15 @@ def _check_run(dataset: Any, config: TrainConfig) -> tuple[int, int]:
         raise TrainingError("no pairs to train on")
     if min(config.batch, config.report_every, config.n_steps(len(dataset))) < 1:
         raise TrainingError("batch, report_every and the number of steps must be at least 1")
+    if config.pixel_loss not in ("l1", "entropy"):
+        raise TrainingError(f"pixel_loss must be 'l1' or 'entropy', not {config.pixel_loss!r}")
+    if config.rotate and not hasattr(dataset, "draw"):
+        raise TrainingError("rotate needs pairs that can be turned, see rol.scan_pairs")
     if config.checkpoint_every % config.report_every:
         every = (config.checkpoint_every, config.report_every)
         raise TrainingError(f"checkpoint_every ({every[0]}) is no multiple of report_every ({every[1]})")
     height, width = dataset[0][0].shape[-2:]
-    check_size((height, width), None, "first pair")
+    check_size((height, width), None, "first pair", 32 if config.network == "unet" else 4)
     return int(height), int(width)
 
 

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 MARGIN_US = 1_000_000  # the drive begins so long before the first scan and ends so long after the last
 LANE_M = 3.2  # from the middle of one lane to that of the other; oncoming traffic is on the right
-KERB_M = 2.4  # from the middle of the lane to a vehicle parked at the left kerb
+KERB_M = 2.6  # from the middle of the lane to a vehicle parked at the left kerb
 SLOT_M = 6.3
 CATALOGUE = 24  # so many different vehicles drive about
 
@@ -131,7 +131,7 @@ def park_vehicles(
         is_free = np.ones(len(slots), dtype=bool)
         for part in (-1.0, 0.0, 1.0):
             middle = slots[:, :2] + part * ahead
-            is_free &= (things.query(middle)[0] > 1.1) & (lane.query(middle)[0] > 2.0)
+            is_free &= (things.query(middle)[0] > 1.1) & (lane.query(middle)[0] > 2.3)
         for slot in slots[is_free]:
             body = build_vehicle(draw_kind(PARKED_KINDS, rng), rng)
             meshes.append(move_mesh(body, slot, 0.0, first_object + len(meshes)))

@@ -29,7 +29,8 @@ if TYPE_CHECKING:
 LIDARS = ("velodyne_left", "velodyne_right")
 FIRST_COUNT, COUNT_STEP = 13, 14  # encoder counts of the radar's rows: 13, 27, ... 5599 of 5600
 WORLD_RADIUS_M = 180.0  # how far from the drive a world grown from a map reaches
-CLEAR_M = 3.0  # what the map does not show stays so far from where the car drives
+CAR_M = 1.8  # so near to where the car drives stands nothing, whatever the map says
+CLEAR_M = 3.0  # what the map does not show stays so far from there
 # Parts of a session that draw from generators of their own.
 DRESS, DRIVE, TRAFFIC, SCANS, SWEEPS, ODOMETRY, GPS, INS, SCAN, SWEEP = range(10)
 
@@ -217,8 +218,9 @@ def _find_route(
     whole, unmapped = _read_map(path, settings.seed, settings.unmapped_share)
     cells = mapped.crop_cells(whole, places, WORLD_RADIUS_M)
     lane = thin_points(poses[:, :2], 0.5)[0]
+    later = mapped.change_cells(cells, rng(DRESS), missing_share=own.changed_share)
     left = mapped.join_cells(
-        mapped.change_cells(cells, rng(DRESS), missing_share=own.changed_share),
+        mapped.crop_cells(later, lane, WORLD_RADIUS_M, clear_m=CAR_M),  # the map keeps traces of traffic
         mapped.crop_cells(unmapped, lane, WORLD_RADIUS_M, clear_m=CLEAR_M),
     )
     drive = interpolate_drive(middles_us, poses)

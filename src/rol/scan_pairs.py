@@ -1,0 +1,249 @@
+"""Pairs for training that are made when asked for, in any heading, from polar scans and lidar points.
+
+A radar that turns sees the world from any heading alike. Turning the car's frame before the scan is resampled
+and before the lidar points are drawn gives a pair that is as good as the recorded one: no pixel is
+interpolated twice, no corner is lost. Images as in the bird's-eye room.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+STEP_M = 0.05  # lidar points are kept once per cell of this edge
+
+
+@dataclass(frozen=True)
+class LidarClouds:
+    """The lidar points of many scans, without the ground, in the radar frame.
+
+    Attributes
+    ----------
+    points : array, shape (m, 2), int16
+        All points, scan by scan, in steps of `STEP_M`.
+    starts : array, shape (n + 1,), int64
+        Where each scan begins.
+    """
+
+    points: np.ndarray
+    starts: np.ndarray
+
+    def cloud(self, index: int) -> np.ndarray:
+        """Give the points of one scan, shape (k, 2) [m]."""
+        return self.points[self.starts[index] : self.starts[index + 1]] * STEP_M
+
+
+class ScanPairs:
+    """Pairs of one session for training, each made from the polar scan and the lidar points.
+
+    Parameters
+    ----------
+    session : rol.oxford.Session
+        The session.
+    jobs : sequence of dict
+        The scans, from `rol.pairs.job_of_row`.
+    clouds : LidarClouds
+        Their lidar points, from `gather_clouds`.
+    settings : dict
+        Those of `rol.pairs.build_pair` that concern the radar image and its size.
+    """
+
+    def __init__(
+        self, session: Any, jobs: Sequence[dict[str, Any]], clouds: LidarClouds, settings: dict[str, Any]
+    ) -> None:
+        if len(jobs) != len(clouds.starts) - 1:
+            raise ValueError(f"{session.name}: {len(jobs)} scans, but clouds of {len(clouds.starts) - 1}")
+        self.session, self.jobs, self.clouds, self.settings = session, list(jobs), clouds, settings
+
+    def __len__(self) -> int:
+        return len(self.jobs)
+
+    def __getitem__(self, index: int) -> tuple[np.ndarray, np.ndarray]:
+        """Give a pair as it was recorded, see `draw`."""
+        return self.draw(index, 0.0)
+
+    def name(self, index: int) -> str:
+        """Name the file of the scan."""
+        return str(self.session.radar_path(self.jobs[index]["radar_stamp"]))
+
+    def draw(self, index: int, turn: float) -> tuple[np.ndarray, np.ndarray]:
+        """Make one pair, the world turned about the radar.
+
+        Parameters
+        ----------
+        index : int
+            Which scan.
+        turn : float
+            Counter-clockwise turn of everything that is seen [rad].
+
+        Returns
+        -------
+        radar, lidar : array, shape (1, h, w), float32
+            -1 for code 0 and for empty, +1 for code 255 and for occupied.
+        """
+        from .bev import points_to_image
+        from .oxford import load_radar
+
+        scan = load_radar(self.session.radar_path(self.jobs[index]["radar_stamp"]))
+        radar = turned_radar_image(scan.codes, scan.azimuths, turn, self.jobs[index]["twist"], self.settings)
+        c, s = np.cos(turn), np.sin(turn)
+        points = self.clouds.cloud(index) @ np.array([[c, s], [-s, c]])
+        size = {
+            name: self.settings[name]
+            for name in ("width", "pixel_size", "max_range")
+            if name in self.settings
+        }
+        lidar = points_to_image(points, **size)
+        images = (
+            image[None].astype(np.float32) / np.float32(127.5) - np.float32(1.0) for image in (radar, lidar)
+        )
+        return tuple(images)  # type: ignore[return-value]
+
+
+def turned_radar_image(
+    codes: np.ndarray, azimuths: np.ndarray, turn: float, twist: Sequence[float], settings: dict[str, Any]
+) -> np.ndarray:
+    """Make the radar image of `rol.pairs.build_pair` from a scan whose surroundings are turned.
+
+    Parameters
+    ----------
+    codes, azimuths : array, shape (a, b) and (a,)
+        The scan [rad].
+    turn : float
+        Counter-clockwise turn [rad].
+    twist : sequence of float
+        Body velocity (vx, vy, yaw rate) before the turn [m/s, m/s, rad/s].
+    settings : dict
+        ``motion`` ("none" or "corrected"), ``range_resolution``, ``range_offset``, ``doppler_seconds``,
+        ``width``, ``pixel_size``, each with the default of `build_pair`.
+
+    Returns
+    -------
+    image : array, shape (width, width), uint8
+        Power 0..255.
+    """
+    from .radar import DOPPLER_SECONDS, MEASURED_RANGE_OFFSET, MEASURED_RANGE_RESOLUTION, polar_to_cartesian
+
+    c, s = np.cos(turn), np.sin(turn)
+    vx, vy, rate = twist
+    turned = (c * vx - s * vy, s * vx + c * vy, rate)
+    power = polar_to_cartesian(
+        codes,
+        azimuths + turn,
+        range_resolution=settings.get("range_resolution", MEASURED_RANGE_RESOLUTION),
+        range_offset=settings.get("range_offset", MEASURED_RANGE_OFFSET),
+        pixel_size=settings.get("pixel_size", 0.25),
+        width=settings.get("width", 512),
+        twist=turned if settings.get("motion", "none") == "corrected" else None,
+        doppler_seconds=settings.get("doppler_seconds", DOPPLER_SECONDS),
+    )
+    return np.rint(power * 255.0).astype(np.uint8)
+
+
+def gather_clouds(
+    session: Any,
+    jobs: Sequence[dict[str, Any]],
+    path: str | Path,
+    settings: dict[str, Any],
+    *,
+    workers: int = 1,
+    report: Callable[[str], None] = lambda line: None,
+) -> LidarClouds:
+    """Read the sweeps of many scans once and keep their points, small enough for memory.
+
+    Parameters
+    ----------
+    session : rol.oxford.Session
+        The session.
+    jobs : sequence of dict
+        The scans, from `rol.pairs.job_of_row`.
+    path : path
+        File for the points, ``*.npz``; read instead if it is there and of these jobs and settings.
+    settings : dict
+        ``motion``, ``min_height`` and ``max_range`` of `rol.pairs.build_pair`.
+    workers : int
+        Processes.
+    report : callable
+        Takes a line about how far it has come.
+
+    Returns
+    -------
+    clouds : LidarClouds
+        In the order of the jobs.
+    """
+    path, about = Path(path), repr((sorted(settings.items()), [sorted(job.items()) for job in jobs]))
+    if path.is_file():
+        with np.load(path) as file:
+            if str(file["about"]) == about:
+                return LidarClouds(file["points"], file["starts"])
+    tasks, parts = [(session, job, settings) for job in jobs], []
+    with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
+        for part in pool.map(_gather_one, tasks, chunksize=8):
+            parts.append(part)
+            if len(parts) % 500 == 0:
+                report(f"{session.name}: lidar points of {len(parts)} of {len(jobs)} scans")
+    clouds = LidarClouds(np.concatenate(parts), np.cumsum([0, *map(len, parts)]))
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f".{path.stem}.{os.getpid()}.tmp.npz")
+    np.savez_compressed(temporary, points=clouds.points, starts=clouds.starts, about=about)
+    os.replace(temporary, path)
+    return clouds
+
+
+def _gather_one(task: tuple[Any, dict[str, Any], dict[str, Any]]) -> np.ndarray:
+    from .lidar import crop_range, remove_ground
+    from .pairs import load_lidar_points
+
+    session, job, settings = task
+    twist = job["twist"] if settings.get("motion", "none") == "corrected" else None
+    points = load_lidar_points(
+        session, job["left_stamp"], job["right_stamp"], mid_stamp_us=job["mid_stamp_us"], twist=twist
+    )
+    points = crop_range(
+        remove_ground(points, settings.get("min_height", -1.5)), settings.get("max_range", 64.0) + 0.25
+    )
+    return np.unique(np.rint(points[:, :2] / STEP_M).astype(np.int16), axis=0)
+
+
+class JoinedPairs:
+    """Several sets of pairs one after the other, as one.
+
+    Parameters
+    ----------
+    parts : sequence
+        Sets with `__len__`, `__getitem__`, `draw` and `name`, such as `ScanPairs`.
+    """
+
+    def __init__(self, parts: Sequence[Any]) -> None:
+        self.parts, self.ends = list(parts), np.cumsum([len(part) for part in parts])
+
+    def __len__(self) -> int:
+        return int(self.ends[-1]) if len(self.ends) else 0
+
+    def _find(self, index: int) -> tuple[Any, int]:
+        if not 0 <= index < len(self):
+            raise IndexError(f"pair {index} of {len(self)}")
+        part = int(np.searchsorted(self.ends, index, side="right"))
+        return self.parts[part], index - int(self.ends[part] - len(self.parts[part]))
+
+    def __getitem__(self, index: int) -> tuple[np.ndarray, np.ndarray]:
+        """Give a pair as it was recorded."""
+        part, place = self._find(index)
+        return part[place]
+
+    def draw(self, index: int, turn: float) -> tuple[np.ndarray, np.ndarray]:
+        """Give a pair turned by an angle [rad]."""
+        part, place = self._find(index)
+        return part.draw(place, turn)
+
+    def name(self, index: int) -> str:
+        """Name the file that a pair comes from."""
+        part, place = self._find(index)
+        return part.name(place)
