@@ -1,6 +1,7 @@
 # make book        set up, run the chapters on the demo profile, render the book
 # make test        set up, then lint, unit tests, all chapters on the smoke profile, and checks of what came out
 # make notebooks   make book, then renew the executed notebooks stored in notebooks/
+# make weights     train a network of config/weights.yaml (NETWORK=rol) and put its weights into data/weights
 # make real        clone the public repositories with the small pieces of real data into data/real
 # make clean       remove everything made by the above but .venv and data/real
 #
@@ -9,15 +10,16 @@
 SHELL := bash
 .SHELLFLAGS := -eu -o pipefail -c
 .DEFAULT_GOAL := help
-.PHONY: help setup book test notebooks real lint format clean
+.PHONY: help setup book test notebooks weights real lint format clean
 
 BIN := .venv/bin
 # The stamp's name is the sum of what is installed, so a changed lock file asks for another stamp.
 STAMP := .venv/set-up-$(shell cat requirements.lock pyproject.toml | cksum | cut -d ' ' -f 1)
 CORES ?= $(shell nproc 2>/dev/null || sysctl -n hw.ncpu)
 PROFILE ?= demo
+NETWORK ?= rol
 SNAKEMAKE = $(BIN)/snakemake --configfile config/$(PROFILE).yaml --cores $(CORES)
-PYTEST = MPLBACKEND=Agg $(BIN)/python -m pytest
+PYTEST = MPLBACKEND=Agg OMP_NUM_THREADS=1 $(BIN)/python -m pytest
 
 help:
 	@sed -n 's/^# \(make .*\)/\1/p' Makefile
@@ -46,6 +48,9 @@ test: $(STAMP) lint
 
 notebooks: book
 	@$(BIN)/python workflow/renew_notebooks.py config/demo.yaml
+
+weights: $(STAMP)
+	@$(BIN)/python workflow/train_weights.py config/weights.yaml $(NETWORK) --threads $(CORES)
 
 real:
 	@mkdir -p data/real

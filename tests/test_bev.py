@@ -80,3 +80,11 @@ def test_refuses_wrong_shapes():
         image_to_points(np.zeros((4, 4, 3)))
     with pytest.raises(ValueError, match="image: expected"):
         image_to_points(np.zeros((4, 5)))
+
+
+def test_points_too_near_are_left_out() -> None:
+    points = image_to_points(
+        np.full((8, 8), 255, dtype=np.uint8), pixel_size=1.0, max_range=5.0, min_range=2.0
+    )
+    gaps = np.hypot(*points.T)
+    assert len(points) == 64 - 12 and gaps.min() >= 2.0

@@ -51,6 +51,13 @@ def test_without_motion_turning_by_rows_moves_rows() -> None:
     assert np.abs(turned.astype(int) - rolled).max() <= 1
 
 
+def test_gain_moves_codes_and_leaves_silence() -> None:
+    codes = np.array([[0, 6, 120, 254]], dtype=np.uint8)
+    np.testing.assert_array_equal(scan_pairs.shift_codes(codes, 2.0), [[0, 10, 124, 255]])
+    np.testing.assert_array_equal(scan_pairs.shift_codes(codes, -4.0), [[0, 1, 112, 246]])
+    assert scan_pairs.shift_codes(codes, 0.0) is codes
+
+
 def make_pairs(tmp_path: Path) -> ScanPairs:
     save_radar(
         tmp_path / "1000.png",

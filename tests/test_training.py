@@ -154,7 +154,7 @@ def test_loss_that_is_not_finite_names_the_step_and_leaves_the_checkpoint(tmp_pa
 class Turnable(list):
     """Pairs that can be turned by quarters, and have names."""
 
-    def draw(self, index: int, turn: float) -> tuple[np.ndarray, np.ndarray]:
+    def draw(self, index: int, turn: float, gain_db: float) -> tuple[np.ndarray, np.ndarray]:
         quarters = round(turn / (0.5 * np.pi))
         return tuple(np.ascontiguousarray(np.rot90(image, quarters, (1, 2))) for image in self[index])
 
@@ -211,7 +211,7 @@ def test_small_u_net_learns_and_comes_back_from_its_file(tmp_path: Path) -> None
         (make_pairs(1, size=48), replace(TINY, network="unet"), "multiples of 32"),
         (make_pairs(1), replace(TINY, network="vnet"), "'vnet' is none of resnet, unet"),
         (make_pairs(1), replace(TINY, pixel_loss="l2"), "pixel_loss must be"),
-        (make_pairs(1), replace(TINY, rotate=True), "rotate needs pairs that can be turned"),
+        (make_pairs(1), replace(TINY, rotate=True), "rotate and gain_spread_db need pairs that are drawn"),
     ],
 )
 def test_runs_that_cannot_be_are_refused(

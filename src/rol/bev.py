@@ -58,7 +58,12 @@ def points_to_image(
 
 
 def image_to_points(
-    image: np.ndarray, *, threshold: int = 128, pixel_size: float = 0.25, max_range: float = 64.0
+    image: np.ndarray,
+    *,
+    threshold: int = 128,
+    pixel_size: float = 0.25,
+    max_range: float = 64.0,
+    min_range: float = 0.0,
 ) -> np.ndarray:
     """Read an occupancy image as points.
 
@@ -70,8 +75,8 @@ def image_to_points(
         Smallest value that counts as occupied.
     pixel_size : float
         Edge of a pixel [m].
-    max_range : float
-        Pixels whose centre is farther from the sensor are left out [m].
+    max_range, min_range : float
+        Pixels whose centre is farther from the sensor, or nearer, are left out [m].
 
     Returns
     -------
@@ -92,4 +97,5 @@ def image_to_points(
         raise ValueError(f"image: expected a square image with one channel, got shape {image.shape}")
     cells = np.argwhere(image >= threshold)
     points = ((image.shape[0] - 1) / 2.0 - cells) * pixel_size
-    return points[np.hypot(points[:, 0], points[:, 1]) <= max_range]
+    ranges = np.hypot(points[:, 0], points[:, 1])
+    return points[(ranges >= min_range) & (ranges <= max_range)]

@@ -60,6 +60,7 @@ class TrainConfig:
     )
     occupied_weight: float = 1.0  # 1: Eq. 4 as printed; above 1, an occupied pixel counts so many times
     rotate: bool = False  # True: every pair in a heading drawn anew; the paper does not
+    gain_spread_db: float = 0.0  # spread of a gain drawn anew for every scan; the paper has none
     learning_rate: float = 2e-4  # Adam; public default
     beta1: float = (
         0.5  # Adam; public default, lower than Adam's own 0.9 because the two losses chase each other

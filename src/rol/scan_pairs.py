@@ -73,8 +73,8 @@ class ScanPairs:
         """Name the file of the scan."""
         return str(self.session.radar_path(self.jobs[index]["radar_stamp"]))
 
-    def draw(self, index: int, turn: float) -> tuple[np.ndarray, np.ndarray]:
-        """Make one pair, the world turned about the radar.
+    def draw(self, index: int, turn: float, gain_db: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
+        """Make one pair, the world turned about the radar, the radar a little deafer or keener.
 
         Parameters
         ----------
@@ -82,6 +82,8 @@ class ScanPairs:
             Which scan.
         turn : float
             Counter-clockwise turn of everything that is seen [rad].
+        gain_db : float
+            Added to all power that is not zero [dB].
 
         Returns
         -------
@@ -92,7 +94,8 @@ class ScanPairs:
         from .oxford import load_radar
 
         scan = load_radar(self.session.radar_path(self.jobs[index]["radar_stamp"]))
-        radar = turned_radar_image(scan.codes, scan.azimuths, turn, self.jobs[index]["twist"], self.settings)
+        codes = shift_codes(scan.codes, gain_db)
+        radar = turned_radar_image(codes, scan.azimuths, turn, self.jobs[index]["twist"], self.settings)
         c, s = np.cos(turn), np.sin(turn)
         points = self.clouds.cloud(index) @ np.array([[c, s], [-s, c]])
         size = {
@@ -105,6 +108,15 @@ class ScanPairs:
             image[None].astype(np.float32) / np.float32(127.5) - np.float32(1.0) for image in (radar, lidar)
         )
         return tuple(images)  # type: ignore[return-value]
+
+
+def shift_codes(codes: np.ndarray, gain_db: float) -> np.ndarray:
+    """Add a gain [dB] to power codes of half a decibel each; what is zero stays zero, the rest stays above it."""
+    if gain_db == 0.0:
+        return codes
+    table = np.clip(np.arange(256) + round(2.0 * gain_db), 1, 255).astype(np.uint8)
+    table[0] = 0
+    return table[codes]
 
 
 def turned_radar_image(
@@ -238,10 +250,10 @@ class JoinedPairs:
         part, place = self._find(index)
         return part[place]
 
-    def draw(self, index: int, turn: float) -> tuple[np.ndarray, np.ndarray]:
-        """Give a pair turned by an angle [rad]."""
+    def draw(self, index: int, turn: float, gain_db: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
+        """Give a pair turned by an angle [rad], its radar louder by a gain [dB]."""
         part, place = self._find(index)
-        return part.draw(place, turn)
+        return part.draw(place, turn, gain_db)
 
     def name(self, index: int) -> str:
         """Name the file that a pair comes from."""

@@ -158,8 +158,8 @@ def train(
     Parameters
     ----------
     dataset, held_out : sequence of (radar, lidar), each array float32 (1, h, w) in [-1, 1]
-        Pairs to learn from, and pairs that are only looked at. With `config.rotate` the former need a method
-        `draw(index, turn)`, see `rol.scan_pairs.ScanPairs`. Where it has a method `name(index)`, errors name
+        Pairs to learn from, and pairs that are only looked at. With `config.rotate` or `config.gain_spread_db`
+        the former need a method `draw(index, turn, gain_db)`, see `rol.scan_pairs.ScanPairs`. Where it has a method `name(index)`, errors name
         the files of a batch by it.
     config : TrainConfig
         The settings.
@@ -312,12 +312,16 @@ def _load_ahead(
     """Give the batches of some steps, each loaded while the one before is learnt from."""
     import torch
 
+    is_drawn = config.rotate or config.gain_spread_db > 0.0
+
     def load(step: int) -> tuple[Tensor, Tensor]:
         batch = pick_pairs(step, len(dataset), config.batch, seed)
-        turns = np.random.default_rng([seed, step, 1]).uniform(-np.pi, np.pi, len(batch))
+        rng = np.random.default_rng([seed, step, 1])
+        turns = rng.uniform(-np.pi, np.pi, len(batch)) * config.rotate
+        gains = rng.normal(0.0, 1.0, len(batch)) * config.gain_spread_db
         pairs = [
-            dataset.draw(int(index), float(turn)) if config.rotate else dataset[int(index)]
-            for index, turn in zip(batch, turns, strict=True)
+            dataset.draw(int(index), float(turn), float(gain)) if is_drawn else dataset[int(index)]
+            for index, turn, gain in zip(batch, turns, gains, strict=True)
         ]
         radar, lidar = (torch.from_numpy(np.stack(side)) for side in zip(*pairs, strict=True))
         return radar, lidar
@@ -341,8 +345,8 @@ def _check_run(dataset: Any, config: TrainConfig) -> tuple[int, int]:
         raise TrainingError("batch, report_every and the number of steps must be at least 1")
     if config.pixel_loss not in ("l1", "entropy"):
         raise TrainingError(f"pixel_loss must be 'l1' or 'entropy', not {config.pixel_loss!r}")
-    if config.rotate and not hasattr(dataset, "draw"):
-        raise TrainingError("rotate needs pairs that can be turned, see rol.scan_pairs")
+    if (config.rotate or config.gain_spread_db > 0.0) and not hasattr(dataset, "draw"):
+        raise TrainingError("rotate and gain_spread_db need pairs that are drawn, see rol.scan_pairs")
     if config.checkpoint_every % config.report_every:
         every = (config.checkpoint_every, config.report_every)
         raise TrainingError(f"checkpoint_every ({every[0]}) is no multiple of report_every ({every[1]})")

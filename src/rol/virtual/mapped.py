@@ -34,6 +34,7 @@ HOUSE_M, BARRIER_M = 9.0, 2.5  # lengths from which a straight row is a house fr
 LONELY_CELLS = 4  # a group of so few cells is a pole
 VEHICLE_M = (1.2, 5.5)  # sizes of lonely groups that are vehicles
 GROUND_TILE_M = 8.0
+PLANT_SPREAD_M = 0.25  # how far leaves and twigs are from where they were, standard deviation
 
 
 class Kind(IntEnum):
@@ -201,7 +202,11 @@ def _group_sizes(points: np.ndarray, groups: np.ndarray) -> tuple[np.ndarray, np
 
 
 def change_cells(
-    cells: Cells, rng: np.random.Generator, *, missing_share: float = 0.05, plant_spread_m: float = 0.25
+    cells: Cells,
+    rng: np.random.Generator,
+    *,
+    missing_share: float = 0.05,
+    plant_spread_m: float = PLANT_SPREAD_M,
 ) -> Cells:
     """Let time pass since the map was made.
 
