@@ -1,7 +1,7 @@
 # make book        set up, run the chapters on the demo profile, render the book
 # make test        set up, then lint, unit tests, all chapters on the smoke profile, and checks of what came out
 # make notebooks   make book, then renew the executed notebooks stored in notebooks/
-# make weights     train a network of config/weights.yaml (NETWORK=rol) and put its weights into data/weights
+# make weights     train a network of data/weights/recipe.yaml (NETWORK=rol) and put its weights into data/weights
 # make real        clone the public repositories with the small pieces of real data into data/real
 # make clean       remove everything made by the above but .venv and data/real
 #
@@ -50,7 +50,7 @@ notebooks: book
 	@$(BIN)/python workflow/renew_notebooks.py config/demo.yaml
 
 weights: $(STAMP)
-	@$(BIN)/python workflow/train_weights.py config/weights.yaml $(NETWORK) --threads $(CORES)
+	@$(BIN)/python workflow/train_weights.py data/weights/recipe.yaml $(NETWORK) --threads $(CORES)
 
 real:
 	@mkdir -p data/real

@@ -1,6 +1,6 @@
 """Train a network whose weights come with the book: sessions, pairs, training, judging, weights and card.
 
-    python workflow/train_weights.py config/weights.yaml rol [--device cuda] [--threads 2]
+    python workflow/train_weights.py data/weights/recipe.yaml rol [--device cuda] [--threads 2]
 
 Every stage goes on where it stopped, at any moment; a stage that is done is not done again. The network's weights go to
 `data/weights/NAME.safetensors` in half precision, what is known about them to `data/weights/NAME.json`.
