@@ -49,7 +49,10 @@ def drive_poses(n: int = 12) -> np.ndarray:
 def small_root(tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("real")
     image = np.zeros((8000, 8000), dtype=np.uint8)
-    for points in known_map().values():
+    for points in (
+        *known_map().values(),
+        np.array([[3.1, 0.1], [6.1, 1.1]]),
+    ):  # traces of traffic on the lane
         image[((1500.0 - points[:, 0]) / 0.25).astype(int), ((800.0 - points[:, 1]) / 0.25).astype(int)] = 255
     for path in (root / rall.MAP_PATH, root / rall.POSES_PATH / "pose_xy_02.txt"):
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -211,6 +214,15 @@ def test_route_session_is_read_back_as_it_was_made(small_root: Path, tmp_path: P
     odometry = oxford.compose_odometry(oxford.load_radar_odometry(found.odometry_path))[2]
     truth = relative_pose(drive_poses()[0], drive_poses()[: len(odometry)])
     assert np.abs(odometry - truth).max() < 0.1
+
+
+def test_traces_of_traffic_on_the_map_do_not_stand_in_the_way(small_root: Path, tmp_path: Path) -> None:
+    made = build_session(load_settings(recipe(tmp_path, small_root, scans=12, vehicles=0, people=0)), NAME)
+    mesh = made.scene.static_mesh
+    upright = mesh.vertices[mesh.triangles].mean(axis=1)
+    upright = upright[upright[:, 2] > 0.2]
+    gaps = np.hypot(*(upright[:, None, :2] - drive_poses()[None, :, :2]).transpose(2, 0, 1)).min(axis=1)
+    assert gaps.min() > 1.0 and (gaps < 12.0).any()
 
 
 def test_a_session_without_sweeps_and_with_two_writers(small_root: Path, tmp_path: Path) -> None:

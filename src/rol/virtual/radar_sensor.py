@@ -70,7 +70,7 @@ class RadarSettings:
     layers_deg: tuple[float, ...] = (1.2, 0.4, -0.4, -1.2, -2.5, -4.6, -8.5, -15.0)
     layer_widths_deg: tuple[float, ...] = (0.8, 0.8, 0.8, 0.8, 1.8, 2.4, 5.0, 8.0)
     layer_gains_db: tuple[float, ...] = (-9.0, -1.0, -1.0, -9.0, -16.0, -19.0, -23.0, -27.0)
-    gain_code: float = 110.5
+    gain_code: float = 109.5
     range_exponent: float = 0.0
     haze_db: float = -17.0
     haze_length: float = 4.0

@@ -122,7 +122,7 @@ class VirtualSettings:
     odometry_yaw_rad: float = 2.0e-4
     world: str = "town"
     real_root: str = ""
-    unmapped_share: float = 1.2
+    unmapped_share: float = 1.8
     lidar: dict[str, Any] = field(default_factory=dict)
     radar: dict[str, Any] = field(default_factory=dict)
 
