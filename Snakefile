@@ -32,8 +32,8 @@ DIGESTS = {chapter: chapters.chapter_digest(NOTEBOOKS / f"{chapter}.ipynb") for 
 RECIPES = (config["virtual"] or {}).get("sessions", {})
 PYTHON, JUPYTER_BOOK = sys.executable, Path(sys.executable).with_name("jupyter-book")
 
-# One job uses the threads it was given and no more. Figures go into the notebook, whatever the caller's environment says.
-ENVIRONMENT = "NUMBA_NUM_THREADS={threads} PYTHONHASHSEED=0 MPLBACKEND=module://matplotlib_inline.backend_inline "
+# One job uses the threads it was given and no more, and threads that wait leave the processor to others. Figures go into the notebook, whatever the caller's environment says.
+ENVIRONMENT = "NUMBA_NUM_THREADS={threads} OMP_WAIT_POLICY=PASSIVE PYTHONHASHSEED=0 MPLBACKEND=module://matplotlib_inline.backend_inline "
 # papermill writes to the log, since Snakemake deletes the outputs of a failed job, and a traceback with it.
 PAPERMILL = ENVIRONMENT + (
     "{PYTHON} -m papermill {input.notebook} {log.notebook} --kernel python3 --no-progress-bar {params.arguments} "
