@@ -11,7 +11,7 @@ PACKAGE = Path(__file__).resolve().parents[1] / "src" / "rol"
 FILES = sorted(file for file in PACKAGE.rglob("*.py") if not file.name.startswith("__"))
 # The heavy parts, and the only files that may bring them in when they are imported.
 HEAVY = {
-    "torch": {"pix2pix.py"},
+    "torch": {"pix2pix.py", "unet.py"},
     "open3d": {"virtual/scene.py"},
     "matplotlib": {"plots.py", "virtual/plots.py"},
 }

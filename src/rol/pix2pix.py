@@ -3,7 +3,7 @@
 Images are tensors of shape (b, 1, h, w) in [-1, 1]: -1 is empty (pixel 0), +1 is occupied (pixel 255). Row 0
 is the farthest forward, column 0 the farthest left. The architecture is that of the public pix2pix and
 CycleGAN code with one channel in and one channel out (Yin et al. 2020, Sec. III-A, Eq. 2-5, and Sec. IV-A).
-This is the only room that imports torch when it is itself imported; `rol.training` holds the loop.
+Only this room and `rol.unet` import torch when they are imported; `rol.training` holds the loop.
 
 Batch norm takes the statistics of the images it is given, in training and in use alike, and keeps no running
 ones. The public code does so too when it is used as its authors use it, and with one image per batch the
