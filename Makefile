@@ -2,6 +2,7 @@
 # make test        set up, then lint, unit tests, all chapters on the smoke profile, and checks of what came out
 # make notebooks   make book, then renew the executed notebooks stored in notebooks/
 # make weights     train a network of data/weights/recipe.yaml (NETWORK=rol) and put its weights into data/weights
+# make judge       judge the weights of a network (NETWORK=rol) again and compare with their card
 # make real        clone the public repositories with the small pieces of real data into data/real
 # make clean       remove everything made by the above but .venv and data/real
 #
@@ -10,7 +11,7 @@
 SHELL := bash
 .SHELLFLAGS := -eu -o pipefail -c
 .DEFAULT_GOAL := help
-.PHONY: help setup book test notebooks weights real lint format clean
+.PHONY: help setup book test notebooks weights judge real lint format clean
 
 BIN := .venv/bin
 # The stamp's name is the sum of what is installed, so a changed lock file asks for another stamp.
@@ -50,7 +51,10 @@ notebooks: book
 	@$(BIN)/python workflow/renew_notebooks.py config/demo.yaml
 
 weights: $(STAMP)
-	@$(BIN)/python workflow/train_weights.py data/weights/recipe.yaml $(NETWORK) --threads $(CORES)
+	@OMP_WAIT_POLICY=PASSIVE $(BIN)/python workflow/train_weights.py data/weights/recipe.yaml $(NETWORK) --threads $(CORES)
+
+judge: $(STAMP)
+	@OMP_WAIT_POLICY=PASSIVE $(BIN)/python workflow/train_weights.py data/weights/recipe.yaml $(NETWORK) --threads $(CORES) --judge
 
 real:
 	@mkdir -p data/real

@@ -30,9 +30,11 @@ RUNS = chapters.all_runs(config)
 PARAMETERS = {run: chapters.run_parameters(config, run) for run in RUNS}  # a name that a notebook lacks ends here
 DIGESTS = {chapter: chapters.chapter_digest(NOTEBOOKS / f"{chapter}.ipynb") for chapter in chapters.CHAPTERS}
 RECIPES = (config["virtual"] or {}).get("sessions", {})
+SHIPPED = [str(path) for path in sorted(Path("data/weights").glob("*.safetensors"))]  # networks that come with the book
 PYTHON, JUPYTER_BOOK = sys.executable, Path(sys.executable).with_name("jupyter-book")
 
-# One job uses the threads it was given and no more, and threads that wait leave the processor to others. Figures go into the notebook, whatever the caller's environment says.
+# One job uses the threads it was given and no more, and threads that wait leave the processor to others.
+# Figures go into the notebook, whatever the caller's environment says.
 ENVIRONMENT = "NUMBA_NUM_THREADS={threads} OMP_WAIT_POLICY=PASSIVE PYTHONHASHSEED=0 MPLBACKEND=module://matplotlib_inline.backend_inline "
 # papermill writes to the log, since Snakemake deletes the outputs of a failed job, and a traceback with it.
 PAPERMILL = ENVIRONMENT + (
@@ -208,6 +210,7 @@ rule real_vs_fake:
         notebook=source("05_real_vs_fake"),
         pairs=expand(OUT + "/pairs/{session}/pairs.json", session=SESSIONS),
         weights=f"{OUT}/pix2pix/generator.safetensors",
+        shipped=SHIPPED,
     output:
         notebook=executed("05_real_vs_fake"),
         fake=expand(OUT + "/fake/{session}/fake.json", session=SESSIONS),
@@ -281,5 +284,59 @@ rule results:
         code=DIGESTS["08_results"],
     message:
         "08 results"
+    shell:
+        PAPERMILL
+
+
+rule real_radar:
+    input:
+        notebook=source("10_real_radar"),
+        weights=f"{OUT}/pix2pix/generator.safetensors",
+        shipped=SHIPPED,
+    output:
+        notebook=executed("10_real_radar"),
+    log:
+        **logs("10_real_radar"),
+    params:
+        arguments=arguments("10_real_radar"),
+        code=DIGESTS["10_real_radar"],
+    threads: 2
+    message:
+        "10 real radar"
+    shell:
+        PAPERMILL
+
+
+rule ablations:
+    input:
+        notebook=source("11_ablations"),
+        tables=[str(path) for path in sorted(Path("data/ablations").glob("*.csv"))],
+        cards=[path.replace(".safetensors", ".json") for path in SHIPPED],
+    output:
+        notebook=executed("11_ablations"),
+    log:
+        **logs("11_ablations"),
+    params:
+        arguments=arguments("11_ablations"),
+        code=DIGESTS["11_ablations"],
+    message:
+        "11 ablations"
+    shell:
+        PAPERMILL
+
+
+rule performance:
+    input:
+        notebook=source("12_performance"),
+        measured=[str(path) for path in sorted(Path("data/performance").glob("*.json"))],
+    output:
+        notebook=executed("12_performance"),
+    log:
+        **logs("12_performance"),
+    params:
+        arguments=arguments("12_performance"),
+        code=DIGESTS["12_performance"],
+    message:
+        "12 performance"
     shell:
         PAPERMILL

@@ -1,27 +1,34 @@
 """How fast the translator is: ours beside the plain way of the same weights, in one run.
 
-python benchmarks/translator.py [--rounds 7] [--threads 2]      prints a table and writes build/benchmarks/translator.json
+python benchmarks/translator.py [--rounds 7] [--threads 2]      prints a table and writes data/performance/translator.json
 
 "plain" is PyTorch as one writes it first: float32, rows of pixels channel by channel, every norm on its own. "ours" keeps
 the channels of a pixel together, multiplies norms into convolutions where they have running statistics, and computes in
 bfloat16 where the processor has instructions for it. Both take turns, so that a busy machine hurts both alike; medians.
+The steps beside the network are held against plain NumPy and against SciPy.
 """
 
 from __future__ import annotations
 
 import argparse
 import copy
+import datetime
 import json
 import platform
+import subprocess
 from collections.abc import Callable
 from pathlib import Path
 from time import perf_counter
 
+import cv2
 import numpy as np
+import scipy
 import torch
+from scipy.ndimage import map_coordinates
 
 from rol.bev import image_to_points
 from rol.pix2pix import TrainConfig, build_generator, generate, has_bf16, load_weights
+from rol.radar import polar_to_cartesian
 from rol.similarity import nn_distances
 from rol.training import TrainingState
 from rol.unet import fuse
@@ -67,8 +74,7 @@ def time_use(name: str, network: torch.nn.Module, image: np.ndarray, rounds: int
     points = [image_to_points(image, threshold=level) for image in grey]
     apart = nn_distances(*points)
     return {
-        **{f"{key} [ms]": 1e3 * value for key, value in found.items()},
-        "times faster": found["plain"] / found["ours"],
+        **compare(found),
         "greatest difference [grey]": float(np.abs(grey[0] - grey[1]).max()),
         "points within a pixel [%]": 100.0 * float((apart <= 0.36).mean()),
     }
@@ -88,16 +94,77 @@ def time_step(config: TrainConfig, rounds: int) -> dict[str, float]:
     ways = {}
     for name, state in states.items():
         used = replace(config, bf16=name == "ours" and has_bf16())
-        parts = [
-            both.get(key)
-            for both in (state.networks, state.optimizers)
-            for key in ("generator", "discriminator")
-        ]
-        ways[name] = lambda parts=parts, used=used: train_step(*parts, *pair, used)
-    found = take_turns(ways, rounds)
+        ways[name] = lambda state=state, used=used: train_step(*state.parts, *pair, used)
+    return compare(take_turns(ways, rounds))
+
+
+def warp_with_scipy(codes: np.ndarray, azimuths: np.ndarray) -> np.ndarray:
+    """Polar to Cartesian as one writes it with SciPy: coordinates of every pixel, and one bilinear look-up."""
+    axis = np.linspace(63.875, -63.875, 512)
+    x, y = np.meshgrid(axis, axis, indexing="ij")
+    rows = np.mod(azimuths[0] - np.arctan2(y, x), 2.0 * np.pi) / (azimuths[0] - azimuths[1])
+    bins = np.hypot(x, y) / 0.0432 - 0.5
+    return map_coordinates(codes / 255.0, [rows, bins], order=1, mode="nearest")
+
+
+def points_with_loops(image: np.ndarray) -> np.ndarray:
+    """Points of an image pixel by pixel, as Eq. 1 reads."""
+    points = []
+    for row in range(512):
+        for column in range(512):
+            x, y = (255.5 - row) * 0.25, (255.5 - column) * 0.25
+            if image[row, column] >= 128 and np.hypot(x, y) <= 64.0:
+                points.append((x, y))
+    return np.array(points)
+
+
+def time_polar(rounds: int) -> dict[str, float]:
+    """Time polar to Cartesian beside SciPy, and say how far the images are apart."""
+    rng = np.random.default_rng(3)
+    codes = np.clip(rng.gamma(1.0, 9.0, (400, 3768)), 0, 255).astype(np.uint8)
+    azimuths = -2.0 * np.pi * np.arange(400) / 400
+    ways = {
+        "plain": lambda: warp_with_scipy(codes, azimuths),
+        "ours": lambda: polar_to_cartesian(codes, azimuths),
+    }
+    images = [way() for way in ways.values()]
+    apart = np.abs(images[0] - images[1])[:, :255]  # SciPy's has a seam behind the first row
+    return {
+        **compare(take_turns(ways, rounds)),
+        "greatest difference [grey]": 255.0 * float(np.median(apart)),
+    }
+
+
+def time_points(rounds: int) -> dict[str, float]:
+    """Time image to points beside the loops of Eq. 1."""
+    image = draw_image(np.random.default_rng(4)) * 2
+    ways = {"plain": lambda: points_with_loops(image), "ours": lambda: image_to_points(image)}
+    assert np.allclose(ways["plain"](), ways["ours"]())
+    return compare(take_turns(ways, rounds))
+
+
+def compare(found: dict[str, float]) -> dict[str, float]:
+    """Put two medians in milliseconds and as a ratio."""
     return {
         **{f"{key} [ms]": 1e3 * value for key, value in found.items()},
         "times faster": found["plain"] / found["ours"],
+    }
+
+
+def describe_machine(threads: int) -> dict[str, object]:
+    """Say on which machine, when, and from which commit and versions the figures come."""
+    commit = subprocess.run(
+        ["git", "rev-parse", "HEAD"], cwd=ROOT, capture_output=True, text=True, check=False
+    ).stdout.strip()
+    lines = Path("/proc/cpuinfo").read_text().splitlines() if Path("/proc/cpuinfo").is_file() else []
+    model = next((line.split(":")[1].strip() for line in lines if line.startswith("model name")), "")
+    return {
+        "processor": model or platform.processor() or platform.machine(),
+        "threads": threads,
+        "bf16 instructions": has_bf16(),
+        "date": datetime.datetime.now(datetime.UTC).strftime("%Y-%m-%d"),
+        "commit": commit,
+        **{module.__name__: module.__version__ for module in (torch, np, scipy, cv2)},
     }
 
 
@@ -122,16 +189,13 @@ def main() -> None:
         f"step, resnet {given.filters}": time_step(
             TrainConfig(filters=given.filters, discriminator_filters=given.filters), max(given.rounds // 3, 1)
         ),
+        "polar to image": time_polar(given.rounds),
+        "image to points": time_points(max(given.rounds // 3, 1)),
     }
-    about = {
-        "machine": platform.processor() or platform.machine(),
-        "bf16": has_bf16(),
-        "threads": given.threads,
-        "torch": torch.__version__,
-    }
+    about = describe_machine(given.threads)
     for name, row in table.items():
         print(name, "  ".join(f"{key} {value:.3g}" for key, value in row.items()), flush=True)
-    path = ROOT / "build" / "benchmarks" / "translator.json"
+    path = ROOT / "data" / "performance" / "translator.json"
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(json.dumps({"about": about, "rows": table}, indent=1) + "\n")
 

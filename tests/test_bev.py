@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from rol.bev import image_to_points, points_to_image
+from rol.bev import crest_pixels, image_to_points, points_to_image
 
 
 def test_pixels_by_hand():
@@ -88,3 +88,23 @@ def test_points_too_near_are_left_out() -> None:
     )
     gaps = np.hypot(*points.T)
     assert len(points) == 64 - 12 and gaps.min() >= 2.0
+
+
+@pytest.mark.parametrize("angle_deg", [0.0, 20.0, 45.0, 70.0, 90.0, 135.0])
+def test_thin_points_lie_on_the_middle_of_a_stroke(angle_deg: float) -> None:
+    y, x = np.mgrid[:129, :129] - 64.0
+    c, s = np.cos(np.deg2rad(angle_deg)), np.sin(np.deg2rad(angle_deg))
+    aside = c * y - s * x  # distance from a line through the middle [pixels]
+    stroke = np.rint(255.0 * np.exp(-0.5 * (aside / 1.5) ** 2)).astype(np.uint8)
+    options = {"pixel_size": 1.0, "max_range": 60.0}
+    thick, thin = (image_to_points(stroke, thin=thin, **options) for thin in (False, True))
+    assert 110 < len(thin) < 180 and len(thick) > 2.2 * len(thin)
+    off = np.abs(c * -thin[:, 0] - s * -thin[:, 1])
+    assert off.max() <= 0.75
+
+
+def test_a_blob_thins_to_little_and_flat_ground_to_nothing() -> None:
+    y, x = np.mgrid[:65, :65] - 32.0
+    blob = np.rint(255.0 * np.exp(-0.5 * (x**2 + y**2) / 36.0)).astype(np.uint8)
+    assert crest_pixels(blob)[blob >= 128].sum() < 0.5 * (blob >= 128).sum()
+    assert not crest_pixels(np.full((20, 20), 200, dtype=np.uint8)).any()

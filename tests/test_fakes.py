@@ -35,8 +35,8 @@ def test_fakes_are_what_the_generator_gives(pairs: Path, tmp_path: Path, generat
     folder = tmp_path / "fake"
     assert prepare_fakes(folder, {"threshold": 1}) == set()
     assert list(write_fakes(generator, pairs, folder, STAMPS)) == STAMPS
-    finish_fakes(folder, {"threshold": 1}, STAMPS)
-    assert list_fakes(folder) == STAMPS
+    finish_fakes(folder, {"threshold": 1}, STAMPS, {"threshold": 140})
+    assert list_fakes(folder) == (STAMPS, {"threshold": 140})
     expected = generate(generator, read_image(pairs / "radar" / f"{STAMPS[1]}.png"))
     np.testing.assert_array_equal(read_image(folder / f"{STAMPS[1]}.png"), expected)
     names = {path.name for path in folder.iterdir()}
@@ -62,7 +62,7 @@ def test_folder_that_is_not_whole_is_not_taken_for_whole(
     with pytest.raises(ValueError, match="fake.json: missing"):
         list_fakes(folder)
     with pytest.raises(ValueError, match=f"{STAMPS[2]}.png: missing"):
-        finish_fakes(folder, {}, STAMPS)
+        finish_fakes(folder, {}, STAMPS, {})
     (folder / "fake.json").write_text('{"stamps": []}')
     with pytest.raises(ValueError, match="fake.json: not a list of fakes"):
         list_fakes(folder)

@@ -223,6 +223,9 @@ class Same(nn.Module):
         super().__init__()
         self.unused = nn.Parameter(torch.zeros(1))
 
+    def logits(self, x: torch.Tensor) -> torch.Tensor:
+        return torch.atanh(x)
+
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         return x
 
@@ -259,6 +262,17 @@ def test_generate_does_not_depend_on_the_mode_and_changes_nothing() -> None:
     np.testing.assert_array_equal(fakes[0], fakes[2])
     assert before.keys() == generator.state_dict().keys()
     assert all(torch.equal(value, generator.state_dict()[name]) for name, value in before.items())
+
+
+def test_headings_are_averaged_and_turned_back() -> None:
+    generator, image = tiny_generator().eval(), radar_image()
+    turned = generate(generator, np.ascontiguousarray(np.rot90(image)), headings=4)
+    np.testing.assert_allclose(
+        np.rot90(turned, -1).astype(int), generate(generator, image, headings=4).astype(int), atol=1
+    )
+    assert not np.array_equal(generate(generator, image), generate(generator, image, headings=4))
+    with pytest.raises(Pix2PixError, match="headings: expected 1 to 4, got 5"):
+        generate(generator, image, headings=5)
 
 
 def test_generate_is_the_function_that_training_saw() -> None:

@@ -1,5 +1,6 @@
 """The readers of the real map, poses and odometry, and what they say of files that are at fault."""
 
+from itertools import pairwise
 from pathlib import Path
 
 import cv2
@@ -30,6 +31,32 @@ def test_real_scan_poses(real_root: Path) -> None:
     poses = rall.load_scan_poses(real_root / rall.SCAN_POSES_PATH)
     assert len(poses) == 11 and min(poses) == 1547131046353776
     np.testing.assert_allclose(poses[1547131046353776], [146.619, -10.956, -0.06091])
+
+
+def test_real_scans_come_with_pose_and_velocity(real_root: Path, tmp_path: Path) -> None:
+    scans = rall.load_scans(real_root)
+    assert [scan.stamp_us for scan in scans] == sorted(scan.stamp_us for scan in scans) and len(scans) == 11
+    assert scans[0].codes.shape == (400, 3768) and scans[0].path.stem == str(scans[0].stamp_us)
+    for before, after in pairwise(scans):
+        seconds = (after.stamp_us - before.stamp_us) * 1e-6
+        speed = np.hypot(*(after.pose - before.pose)[:2]) / seconds
+        assert 0.5 * (before.twist[0] + after.twist[0]) == pytest.approx(speed, abs=0.25)
+    # Without the official odometry the poses tell the velocity, and a scan that is far from all others has none.
+    folder = tmp_path / rall.SCANS_PATH / "radar"
+    folder.mkdir(parents=True)
+    lines = ["timestamp_us,x_m,y_m,yaw_rad"]
+    for scan in (*scans[:2], scans[-1]):
+        (folder / scan.path.name).write_bytes(scan.path.read_bytes())
+        lines.append(",".join(map(str, (scan.stamp_us, *scan.pose))))
+    (tmp_path / rall.SCAN_POSES_PATH).write_text("\n".join(lines))
+    alone = rall.load_scans(tmp_path)
+    assert alone[0].twist == pytest.approx(scans[0].twist, abs=0.3) and alone[2].twist is None
+
+
+def test_real_scans_that_are_missing_are_told(tmp_path: Path) -> None:
+    (tmp_path / rall.SCAN_POSES_PATH).write_text("timestamp_us,x_m,y_m,yaw_rad\n1,0,0,0\n")
+    with pytest.raises(rall.RallError, match="holds none of the 1 scans"):
+        rall.load_scans(tmp_path)
 
 
 def test_find_real_root(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

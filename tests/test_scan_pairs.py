@@ -58,6 +58,30 @@ def test_gain_moves_codes_and_leaves_silence() -> None:
     assert scan_pairs.shift_codes(codes, 0.0) is codes
 
 
+def test_streaks_brighten_a_few_rows_and_darken_nothing() -> None:
+    codes = bright_spot(-1.2, 35.0)
+    dazzled = scan_pairs.add_streaks(codes, 2, np.random.default_rng(1))
+    assert (dazzled >= codes).all() and codes[0, 0] == 6
+    changed = np.flatnonzero((dazzled != codes).mean(axis=1) > 0.2)
+    assert 2 <= len(changed) <= 14  # of 400
+    near, far = (np.median(dazzled[changed][:, part]) for part in (slice(700, 900), slice(3000, 3700)))
+    assert near > far + 10
+    np.testing.assert_array_equal(dazzled, scan_pairs.add_streaks(codes, 2, np.random.default_rng(1)))
+    np.testing.assert_array_equal(scan_pairs.add_streaks(codes, 0, np.random.default_rng(1)), codes)
+
+
+def test_ghosts_are_echoes_elsewhere() -> None:
+    codes = bright_spot(-1.2, 35.0)
+    haunted = scan_pairs.add_ghosts(codes, 5, np.random.default_rng(1))
+    assert (haunted >= codes).all() and (codes > 6).sum() == 51
+    changed = np.argwhere(haunted != codes)
+    assert 5 < len(changed) <= 5 * 51 and changed[:, 1].max() < 1600
+    assert haunted[tuple(changed.T)].max() <= 200 and haunted[tuple(changed.T)].max() > 100
+    np.testing.assert_array_equal(haunted, scan_pairs.add_ghosts(codes, 5, np.random.default_rng(1)))
+    quiet = np.full((400, 3768), 6, dtype=np.uint8)  # nothing bright, no ghosts
+    np.testing.assert_array_equal(scan_pairs.add_ghosts(quiet, 5, np.random.default_rng(1)), quiet)
+
+
 def make_pairs(tmp_path: Path) -> ScanPairs:
     save_radar(
         tmp_path / "1000.png",
@@ -85,6 +109,11 @@ def test_both_sides_of_a_pair_turn_together(tmp_path: Path) -> None:
     assert gaps.max() <= 0.5 * 0.5 * np.sqrt(2.0) + 1e-9
     for plain, again in zip(pairs[0], pairs.draw(0, 0.0), strict=True):
         np.testing.assert_array_equal(plain, again)
+    dazzled = pairs.draw(0, 0.0, 0.0, 3, 2, np.random.default_rng(2))
+    assert (dazzled[0] > pairs[0][0]).sum() > 100  # the radar alone
+    np.testing.assert_array_equal(dazzled[1], pairs[0][1])
+    with pytest.raises(ValueError, match="need a generator"):
+        pairs.draw(0, 0.0, 0.0, 1)
 
 
 def test_joined_sets_count_on(tmp_path: Path) -> None:

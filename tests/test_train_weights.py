@@ -1,9 +1,11 @@
 """The workflow behind the weights that come with the book, on a tiny recipe."""
 
 import json
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 import yaml
 
@@ -25,13 +27,24 @@ sets:
   rest: [{session: virtual-x, every: 3}]
 networks:
   tiny: {network: unet, filters: 4, blocks: 1, gan_weight: 0, pixel_loss: entropy, lambda_l1: 1, rotate: true,
-         gain_spread_db: 2.0, steps: 6, batch: 2, report_every: 2, checkpoint_every: 2}
+         gain_spread_db: 2.0, streaks: 1.0, reach: 0.7, thin: true, steps: 6, batch: 2, report_every: 2, checkpoint_every: 2}
   wrong: {filter: 4}
+ablations:
+  base: {network: unet, filters: 4, blocks: 1, gan_weight: 0, pixel_loss: entropy, lambda_l1: 1, steps: 2, report_every: 2,
+         checkpoint_every: 2}
+  variants: {base: {}, turned: {rotate: true, seed: 2}}
 """
 
 
 @pytest.fixture(scope="module")
-def recipe(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def monkeypatch_module() -> Iterator[pytest.MonkeyPatch]:
+    with pytest.MonkeyPatch.context() as patch:
+        yield patch
+
+
+@pytest.fixture(scope="module")
+def recipe(tmp_path_factory: pytest.TempPathFactory, monkeypatch_module: pytest.MonkeyPatch) -> Path:
+    monkeypatch_module.setattr(train_weights, "open_real", lambda: None)
     folder = tmp_path_factory.mktemp("weights")
     places = {"out_dir": str(folder / "out"), "sessions_root": str(folder / "sessions")}
     path = folder / "recipe.yaml"
@@ -51,8 +64,14 @@ def test_one_command_makes_sessions_weights_and_card(
         and "torch" in card["versions"]
     )
     assert card["history"]["step"] == [2, 4, 6] and card["history"]["loss_gan"] == [None] * 3
-    assert card["judged"]["rest"]["threshold"] == list(train_weights.LEVELS)
-    assert load_metadata(tmp_path / "tiny.safetensors")["card"] == "tiny.json"
+    judged = pd.DataFrame(card["judged"])
+    assert judged[judged.places == "rest"].threshold.tolist() == list(train_weights.LEVELS)
+    header = load_metadata(tmp_path / "tiny.safetensors")
+    assert header["card"] == "tiny.json" and header["points"] == {
+        "threshold": card["threshold"],
+        "thin": True,
+    }
+    assert header["pairs_settings"]["motion"] == "corrected"
     fake = generate(load_weights(tmp_path / "tiny.safetensors"), np.zeros((64, 64), dtype=np.uint8))
     assert fake.shape == (64, 64)
     capsys.readouterr()
@@ -61,7 +80,36 @@ def test_one_command_makes_sessions_weights_and_card(
     )  # all is there: nothing is trained again
     again = json.loads((tmp_path / "tiny.json").read_text())
     assert again["history"] == card["history"] and again["judged"] == card["judged"]
-    assert "step" not in capsys.readouterr().out.split("rest:")[1].split("{")[0]
+    assert "tiny: step" not in capsys.readouterr().out
+    assert train_weights.main([str(recipe), "tiny", "--threads", "1", "--judge"]) == 0
+    assert "largest difference of a share: 0.0" in capsys.readouterr().out
+    judged.fake_to_real_within_1m += 0.1
+    (tmp_path / "tiny.json").write_text(json.dumps({**card, "judged": train_weights.as_lists(judged)}))
+    assert train_weights.main([str(recipe), "tiny", "--threads", "1", "--judge"]) == 1
+
+
+def test_ablations_are_run_once_and_gathered(
+    recipe: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(train_weights, "ABLATIONS", tmp_path / "a" / "translator.csv")
+    assert train_weights.main([str(recipe), "ablations", "--threads", "1"]) == 0
+    table = pd.read_csv(tmp_path / "a" / "translator.csv")
+    assert (
+        table.network.unique().tolist() == ["ablation-base", "ablation-turned"] and (table.steps == 2).all()
+    )
+    assert {"rest"} <= set(table.places) and "fake_to_real_within_1m_sd" in table
+    monkeypatch.setattr(train_weights, "run_network", lambda *_: pytest.fail("trained again"))
+    assert train_weights.main([str(recipe), "ablations", "--threads", "1"]) == 0
+
+
+def test_threshold_is_the_highest_that_still_reaches() -> None:
+    judged = pd.DataFrame({
+        "places": ["a"] * 3 + ["b"] * 3 + ["real"], "threshold": [64, 128, 192] * 2 + [224],
+        "real_to_fake_within_1m": [0.9, 0.8, 0.5, 0.8, 0.7, 0.6, np.nan],
+    })  # fmt: skip
+    assert train_weights.choose_threshold(judged, 0.7) == 128
+    assert train_weights.choose_threshold(judged, 0.5) == 192
+    assert train_weights.choose_threshold(judged, 0.99) == 128 == train_weights.choose_threshold(judged, None)
 
 
 def test_places_choose_scans_and_waiting_ones_are_left_out(recipe: Path) -> None:
@@ -79,7 +127,10 @@ def test_places_choose_scans_and_waiting_ones_are_left_out(recipe: Path) -> None
 
 @pytest.mark.parametrize(
     ("arguments", "fault"),
-    [(["wrong"], "wrong: no such setting: filter"), (["none"], "no network 'none'; there are: tiny, wrong")],
+    [
+        (["wrong"], "wrong: no such setting: filter"),
+        (["none"], "no network 'none'; there are: tiny, wrong, ablation-base"),
+    ],
 )
 def test_faulty_recipes_are_told(recipe: Path, arguments: list[str], fault: str) -> None:
     with pytest.raises(ValueError, match=fault):
@@ -88,7 +139,7 @@ def test_faulty_recipes_are_told(recipe: Path, arguments: list[str], fault: str)
 
 def test_recipes_that_lack_a_part_are_told(tmp_path: Path) -> None:
     (tmp_path / "r.yaml").write_text("seed: 1\n")
-    with pytest.raises(ValueError, match="r.yaml: the key 'networks' is missing"):
+    with pytest.raises(ValueError, match="r.yaml: the key 'ablations' is missing"):
         train_weights.load_recipe(tmp_path / "r.yaml")
     with pytest.raises(ValueError, match="no world has a session 'virtual-y'; there are: virtual-x"):
         train_weights.make_sessions(

@@ -154,8 +154,10 @@ def test_loss_that_is_not_finite_names_the_step_and_leaves_the_checkpoint(tmp_pa
 class Turnable(list):
     """Pairs that can be turned by quarters, and have names."""
 
-    def draw(self, index: int, turn: float, gain_db: float) -> tuple[np.ndarray, np.ndarray]:
-        quarters = round(turn / (0.5 * np.pi))
+    def draw(
+        self, index: int, turn: float, gain_db: float, n_streaks: int, n_ghosts: int, rng: np.random.Generator
+    ) -> tuple[np.ndarray, np.ndarray]:
+        quarters = round(turn / (0.5 * np.pi)) + int(rng.integers(2)) * n_streaks
         return tuple(np.ascontiguousarray(np.rot90(image, quarters, (1, 2))) for image in self[index])
 
     def name(self, index: int) -> str:
@@ -163,9 +165,9 @@ class Turnable(list):
 
 
 def test_turned_pairs_are_drawn_from_seed_and_step_alone(tmp_path: Path) -> None:
-    config, pairs = replace(TINY, rotate=True, batch=2, gan_weight=0.0), Turnable(make_pairs(6))
+    config, pairs = replace(TINY, rotate=True, streaks=1.0, batch=2, gan_weight=0.0), Turnable(make_pairs(6))
     whole = train(pairs, config, tmp_path / "whole", seed=1, loaders=3)[1]
-    plain = train(pairs, replace(config, rotate=False), tmp_path / "plain", seed=1)[1]
+    plain = train(pairs, replace(config, rotate=False, streaks=0.0), tmp_path / "plain", seed=1)[1]
     assert not np.allclose(whole["loss_l1"], plain["loss_l1"])
     assert whole["loss_gan"].isna().all() and "discriminator" not in str(
         load_metadata(tmp_path / "whole" / "generator.safetensors")
@@ -212,7 +214,11 @@ def test_small_u_net_learns_and_comes_back_from_its_file(tmp_path: Path) -> None
         (make_pairs(1, size=48), replace(TINY, network="unet"), "multiples of 32"),
         (make_pairs(1), replace(TINY, network="vnet"), "'vnet' is none of resnet, unet"),
         (make_pairs(1), replace(TINY, pixel_loss="l2"), "pixel_loss must be"),
-        (make_pairs(1), replace(TINY, rotate=True), "rotate and gain_spread_db need pairs that are drawn"),
+        (
+            make_pairs(1),
+            replace(TINY, rotate=True),
+            "rotate, gain_spread_db, streaks and ghosts need pairs that are drawn",
+        ),
     ],
 )
 def test_runs_that_cannot_be_are_refused(

@@ -1,9 +1,13 @@
 """Train a network whose weights come with the book: sessions, pairs, training, judging, weights and card.
 
     python workflow/train_weights.py data/weights/recipe.yaml rol [--device cuda] [--threads 2]
+    python workflow/train_weights.py data/weights/recipe.yaml rol --judge
+    python workflow/train_weights.py data/weights/recipe.yaml ablations
 
 Every stage goes on where it stopped, at any moment; a stage that is done is not done again. The network's weights go to
-`data/weights/NAME.safetensors` in half precision, what is known about them to `data/weights/NAME.json`.
+`data/weights/NAME.safetensors` in half precision, what is known about them to `data/weights/NAME.json`. With `--judge`
+nothing is trained: the weights that are there are judged again and held against their card. Of the ablations no weights
+are kept, only how they were judged: `data/ablations/translator.csv`.
 """
 
 from __future__ import annotations
@@ -13,6 +17,8 @@ import importlib.metadata
 import json
 import platform
 import sys
+import time
+import zlib
 from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any
@@ -27,12 +33,14 @@ from rol.oxford import compose_odometry, load_radar_odometry, open_session
 from rol.pairs import estimate_twists, job_of_row
 from rol.scan_pairs import JoinedPairs, ScanPairs, gather_clouds
 
-WEIGHTS = Path(__file__).resolve().parents[1] / "data" / "weights"
+DATA = Path(__file__).resolve().parents[1] / "data"
+WEIGHTS, ABLATIONS = DATA / "weights", DATA / "ablations" / "translator.csv"
 VERSIONS = ("numpy", "scipy", "torch", "opencv-python-headless", "open3d-cpu")
 LICENCE = (
     "MIT; learnt from simulated data, partly in a world grown from the lidar map of RaLL (Yin et al. 2021)"
 )
-LEVELS = (64, 96, 128, 160, 192, 224)
+TOLERANCE = 0.01  # of a share, between processors
+LEVELS = (64, 96, 112, 128, 144, 160, 176, 192, 208, 224)  # grey values at which points are judged
 
 
 def say(line: str) -> None:
@@ -43,7 +51,9 @@ def say(line: str) -> None:
 def load_recipe(path: Path) -> dict[str, Any]:
     """Read the recipe and refuse one that lacks a part."""
     recipe = yaml.safe_load(path.read_text(encoding="utf-8"))
-    missing = {"out_dir", "sessions_root", "seed", "pairs", "worlds", "sets", "networks"} - set(recipe or {})
+    missing = {"out_dir", "sessions_root", "seed", "pairs", "worlds", "sets", "networks", "ablations"} - set(
+        recipe or {}
+    )
     if missing:
         raise ValueError(f"{path}: the key {min(missing)!r} is missing")
     return recipe
@@ -88,78 +98,223 @@ def choose_jobs(root: Path, part: dict[str, Any], motion: str) -> tuple[Any, lis
     return session, [jobs[i] for i in np.flatnonzero(chosen & moved)[:: part.get("every", 1)]]
 
 
-def open_set(recipe: dict[str, Any], name: str, workers: int) -> JoinedPairs:
-    """Give one set of pairs; its lidar points are read once and kept."""
+def open_set(recipe: dict[str, Any], name: str, workers: int, stride: int = 1) -> JoinedPairs:
+    """Give one set of pairs, or every so many of it; its lidar points are read once and kept."""
     root, out, settings = Path(recipe["sessions_root"]), Path(recipe["out_dir"]), recipe["pairs"]
     parts = []
     for part in recipe["sets"][name]:
         session, jobs = choose_jobs(root, part, settings["motion"])
-        path = out / "clouds" / f"{name}-{part['session']}.npz"
+        jobs = jobs[::stride]
+        path = out / "clouds" / f"{part['session']}-{zlib.crc32(repr(jobs).encode()):08x}.npz"
         clouds = gather_clouds(session, jobs, path, settings, workers=workers, report=say)
         parts.append(ScanPairs(session, jobs, clouds, settings))
         say(f"{name}: {len(jobs)} pairs of {part['session']}")
     return JoinedPairs(parts)
 
 
-def make_card(
-    recipe: dict[str, Any], name: str, history: pd.DataFrame, figures: dict[str, Any]
-) -> dict[str, Any]:
-    """Put down all that is known about a network."""
-    return {
+def open_real() -> tuple[list[Any], Any] | None:
+    """Give the real scans and the tree of the real map, or None where the real data are not at hand."""
+    from scipy.spatial import cKDTree
+
+    from rol import rall
+
+    root = rall.find_real_root()
+    if root is None or not (root / rall.SCAN_POSES_PATH).is_file():
+        say("no real scans at hand: the network is judged on virtual places alone")
+        return None
+    return rall.load_scans(root), cKDTree(rall.load_map_points(root / rall.MAP_PATH))
+
+
+def judge(
+    generator: Any, sets: dict[str, JoinedPairs], real: Any, settings: dict[str, Any], thin: bool
+) -> pd.DataFrame:
+    """Judge a network on every set but the one it learnt from, and on the real scans against the real map."""
+    from rol.bev import image_to_points
+    from rol.front_ends import MIN_RANGE_M, Translator, judge_on_map, translate_scan
+    from rol.training import score_points
+
+    tables = [
+        score_points(generator, pairs, LEVELS, thin=thin).assign(places=name)
+        for name, pairs in sets.items() if not name.startswith("learn")
+    ]  # fmt: skip
+    rows, translator = [], Translator(generator, {}, settings, {})
+    for scan in [] if real is None else real[0]:
+        _, _, fake = translate_scan(translator, scan.codes, scan.azimuths, scan.twist)
+        for level in LEVELS:
+            points = image_to_points(fake, threshold=level, min_range=MIN_RANGE_M, thin=thin)
+            shares = judge_on_map(points, scan.pose, real[1])
+            near = {f"fake_to_real_within_{r}m": shares[f"share_{r}m"] for r in (1, 2)}
+            rows.append({"threshold": level, "n_fake": shares["n"], **near})
+    if rows:
+        by_level = pd.DataFrame(rows).groupby("threshold")
+        mean_sd = by_level.mean().join(by_level.std().add_suffix("_sd"))
+        mean_sd["n_fake_min"] = by_level.n_fake.min()
+        tables.append(mean_sd.reset_index().assign(places="real"))
+    return pd.concat(tables, ignore_index=True).round(4)
+
+
+def choose_threshold(judged: pd.DataFrame, reach: float | None) -> int:
+    """Choose the highest level at which so large a share of the real points of the virtual places is still reached."""
+    if reach is None:
+        return 128
+    reached = judged[judged.places != "real"].groupby("threshold").real_to_fake_within_1m.mean()
+    return int(max(reached.index[reached >= reach], default=128))
+
+
+def run_network(
+    recipe: dict[str, Any],
+    name: str,
+    asked: dict[str, Any],
+    sets: dict[str, JoinedPairs],
+    given: Any,
+    real: Any,
+) -> tuple[Any, dict[str, Any], dict[str, Any]]:
+    """Train and judge one network; give it, the header of its file and its card."""
+    from rol.pix2pix import TrainConfig, has_bf16
+    from rol.training import train
+
+    own = {key: value for key, value in asked.items() if key not in ("learn", "reach", "seed", "thin")}
+    unknown = set(own) - {field.name for field in fields(TrainConfig)}
+    if unknown:
+        raise ValueError(f"{given.recipe}: {name}: no such setting: {min(unknown)}")
+    config = TrainConfig(**own)
+    if config.bf16 and not has_bf16(given.device):
+        raise ValueError(
+            f"{given.recipe}: {name}: this processor has no bf16 instructions; set bf16 to false and have time"
+        )
+    seed = asked.get("seed", recipe["seed"])
+    begin = time.perf_counter()
+    generator, history = train(
+        sets[asked.get("learn", "learn")], config, Path(recipe["out_dir"]) / name, seed=seed,
+        device=given.device, loaders=given.threads,
+        on_report=lambda row, _: say(f"{name}: " + " ".join(f"{key} {value:.5g}" for key, value in row.items())),
+    )  # fmt: skip
+    seconds = time.perf_counter() - begin
+    thin = bool(asked.get("thin", False))
+    judged = judge(generator, sets, real, recipe["pairs"], thin)
+    threshold = choose_threshold(judged, asked.get("reach"))
+    about = {
+        "name": name, "config": asdict(config), "seed": seed, "card": f"{name}.json",
+        "pairs_settings": recipe["pairs"], "points": {"threshold": threshold, "thin": thin},
+    }  # fmt: skip
+    card = {
         "name": name,
-        "recipe": {
-            **{key: recipe[key] for key in ("seed", "pairs", "worlds", "sets")},
-            "network": recipe["networks"][name],
-        },
+        "threshold": threshold,
+        "thin": thin,
+        "recipe": {**{key: recipe[key] for key in ("seed", "pairs", "worlds", "sets")}, "network": asked},
+        "pairs": {part: len(pairs) for part, pairs in sets.items()},
+        "weights": sum(weight.numel() for weight in generator.parameters()),
+        "last_run_s": round(seconds, 1),
         "versions": {package: importlib.metadata.version(package) for package in VERSIONS},
         "python": platform.python_version(),
         "machine": platform.machine(),
+        "device": given.device,
         "licence": LICENCE,
-        "judged": figures,
-        "history": history.round(6).replace({np.nan: None}).to_dict("list"),
+        "judged": as_lists(judged),
+        "history": as_lists(history.round(6)),
     }
+    return generator, about, card
+
+
+def as_lists(table: pd.DataFrame) -> dict[str, list[Any]]:
+    """Turn a table into lists that JSON can hold."""
+    return table.astype(object).where(table.notna(), None).to_dict("list")
+
+
+def ship(generator: Any, about: dict[str, Any], card: dict[str, Any]) -> None:
+    """Write weights and card of a network to where the book takes them from."""
+    from rol.pix2pix import save_weights
+
+    save_weights(WEIGHTS / f"{card['name']}.safetensors", generator.cpu(), about, half=True)
+    write_text(WEIGHTS / f"{card['name']}.json", json.dumps(card, indent=1) + "\n")
+    say(f"{card['name']}: threshold {card['threshold']}\n{pd.DataFrame(card['judged']).to_string()}")
+
+
+def judge_again(recipe: dict[str, Any], name: str, sets: dict[str, JoinedPairs], real: Any) -> int:
+    """Judge the weights that come with the book and print what their card says beside it; 1 if they differ."""
+    from rol.pix2pix import load_weights
+
+    card = json.loads((WEIGHTS / f"{name}.json").read_text())
+    generator = load_weights(WEIGHTS / f"{name}.safetensors")
+    tables = [judge(generator, sets, real, recipe["pairs"], card["thin"]), pd.DataFrame(card["judged"])]
+    columns = ["n_fake", "fake_to_real_within_1m", "fake_to_real_within_2m", "real_to_fake_within_1m"]
+    now, then = (
+        table[table.threshold == card["threshold"]].set_index("places")[columns].astype(float)
+        for table in tables
+    )
+    both = pd.concat({"now": now, "card": then.loc[now.index]}, axis=1)
+    apart = (now - then.loc[now.index])[columns[1:]].abs().max().max()
+    say(
+        f"{name} at threshold {card['threshold']}\n{both.to_string()}\nlargest difference of a share: {apart:.4f}"
+    )
+    return int(apart > TOLERANCE)
+
+
+def is_done(card: Path, asked: dict[str, Any]) -> bool:
+    """Say whether a network was trained and judged with these very settings."""
+    return card.is_file() and json.loads(card.read_text())["recipe"]["network"] == asked
+
+
+def write_ablations(recipe: dict[str, Any], names: list[str]) -> None:
+    """Gather what the cards of the ablations say into one table."""
+    tables = []
+    for name in names:
+        path = Path(recipe["out_dir"]) / name / "card.json"
+        if path.is_file():
+            card = json.loads(path.read_text())
+            steps = len(card["history"]["step"]) and card["history"]["step"][-1]
+            tables.append(
+                pd.DataFrame(card["judged"]).assign(network=name, steps=steps, weights=card["weights"])
+            )
+    table = pd.concat(tables, ignore_index=True)
+    first = ["network", "steps", "weights", "places", "threshold"]
+    table = table[[*first, *(column for column in table if column not in first)]]
+    ABLATIONS.parent.mkdir(parents=True, exist_ok=True)
+    write_text(ABLATIONS, table.to_csv(index=False))
 
 
 def main(arguments: list[str] | None = None) -> int:
     """Train, judge and write what is asked for."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("recipe", type=Path)
-    parser.add_argument("network")
+    parser.add_argument("network", help="a network of the recipe, or 'ablations'")
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--threads", type=int, default=2)
+    parser.add_argument(
+        "--judge", action="store_true", help="train nothing, judge the weights that are there"
+    )
     given = parser.parse_args(arguments)
     import torch
 
-    from rol.pix2pix import TrainConfig, save_weights
-    from rol.training import score_points, train
-
     torch.set_num_threads(given.threads)
     recipe = load_recipe(given.recipe)
-    if given.network not in recipe["networks"]:
-        raise ValueError(f"no network {given.network!r}; there are: {', '.join(recipe['networks'])}")
-    asked = recipe["networks"][given.network]
-    unknown = set(asked) - {field.name for field in fields(TrainConfig)}
-    if unknown:
-        raise ValueError(f"networks: {given.network}: no such setting: {min(unknown)}")
-    config = TrainConfig(**asked)
+    variants = {f"ablation-{name}": {**recipe["ablations"]["base"], **changes}
+                for name, changes in recipe["ablations"]["variants"].items()}  # fmt: skip
+    known = {**recipe["networks"], **variants}
+    names = list(variants) if given.network == "ablations" else [given.network]
+    if names[0] not in known:
+        raise ValueError(f"no network {given.network!r}; there are: {', '.join([*known, 'ablations'])}")
+    wanted = {name for name in recipe["sets"] if not name.startswith("learn")}
+    if not given.judge:
+        wanted |= {known[name].get("learn", "learn") for name in names}
     make_sessions(
-        recipe, {part["session"] for parts in recipe["sets"].values() for part in parts}, given.threads
+        recipe, {part["session"] for name in wanted for part in recipe["sets"][name]}, given.threads
     )
-    sets = {name: open_set(recipe, name, given.threads) for name in recipe["sets"]}
-    folder = Path(recipe["out_dir"]) / given.network
-    generator, history = train(
-        sets["learn"], config, folder, seed=recipe["seed"], device=given.device, loaders=given.threads,
-        on_report=lambda row, _: say(" ".join(f"{key} {value:.5g}" for key, value in row.items())),
-    )  # fmt: skip
-    figures = {
-        name: score_points(generator, pairs, LEVELS).round(4).to_dict("list")
-        for name, pairs in sets.items() if name != "learn"
-    }  # fmt: skip
-    card = make_card(recipe, given.network, history, figures)
-    about = {"config": asdict(config), "seed": recipe["seed"], "card": f"{given.network}.json"}
-    save_weights(WEIGHTS / f"{given.network}.safetensors", generator.cpu(), about, half=True)
-    write_text(WEIGHTS / f"{given.network}.json", json.dumps(card, indent=1) + "\n")
-    say(json.dumps(figures, indent=1))
+    coarse = {name: 2 for name in wanted if given.network == "ablations" and not name.startswith("learn")}
+    sets = {name: open_set(recipe, name, given.threads, coarse.get(name, 1)) for name in sorted(wanted)}
+    real = open_real()
+    if given.judge:
+        return judge_again(recipe, names[0], sets, real)
+    for name in names:
+        kept = Path(recipe["out_dir"]) / name / "card.json"
+        if name in variants and is_done(kept, known[name]):
+            continue
+        generator, about, card = run_network(recipe, name, known[name], sets, given, real)
+        write_text(kept, json.dumps(card, indent=1) + "\n")
+        if name in variants:
+            write_ablations(recipe, list(variants))
+        else:
+            ship(generator, about, card)
     return 0
 
 

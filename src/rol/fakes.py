@@ -77,7 +77,9 @@ def write_fakes(
         yield int(stamp)
 
 
-def finish_fakes(folder: str | Path, settings: dict[str, Any], stamps_us: Sequence[int]) -> None:
+def finish_fakes(
+    folder: str | Path, settings: dict[str, Any], stamps_us: Sequence[int], points: dict[str, Any]
+) -> None:
     """Write ``fake.json``, which makes a folder of fakes whole; every fake must be there.
 
     Parameters
@@ -88,6 +90,8 @@ def finish_fakes(folder: str | Path, settings: dict[str, Any], stamps_us: Sequen
         As given to `prepare_fakes`.
     stamps_us : sequence of int
         Radar stamps in the order of time [us].
+    points : dict
+        How those who read the fakes make points of them: arguments of `rol.bev.image_to_points`.
 
     Raises
     ------
@@ -98,12 +102,13 @@ def finish_fakes(folder: str | Path, settings: dict[str, Any], stamps_us: Sequen
         path = Path(folder) / f"{int(stamp)}.png"
         if not path.is_file():
             raise ValueError(f"{path}: missing, the fakes are not complete")
-    about = {"settings": settings, "stamps_us": [int(stamp) for stamp in stamps_us]}
+    stamps = [int(stamp) for stamp in stamps_us]
+    about = {"settings": settings, "points": points, "stamps_us": stamps}
     _write_bytes(Path(folder) / "fake.json", json.dumps(about, indent=1, sort_keys=True).encode())
 
 
-def list_fakes(folder: str | Path) -> list[int]:
-    """List the radar stamps of a complete folder of fakes.
+def list_fakes(folder: str | Path) -> tuple[list[int], dict[str, Any]]:
+    """List the radar stamps of a complete folder of fakes, and say how points are made of them.
 
     Parameters
     ----------
@@ -114,6 +119,8 @@ def list_fakes(folder: str | Path) -> list[int]:
     -------
     stamps_us : list of int
         Radar stamps in the order of time [us].
+    points : dict
+        Arguments of `rol.bev.image_to_points`.
 
     Raises
     ------
@@ -124,7 +131,8 @@ def list_fakes(folder: str | Path) -> list[int]:
     if not path.is_file():
         raise ValueError(f"{path}: missing; chapter 05 writes it when all fakes of the session are there")
     try:
-        return [int(stamp) for stamp in json.loads(path.read_text())["stamps_us"]]
+        about = json.loads(path.read_text())
+        return [int(stamp) for stamp in about["stamps_us"]], dict(about["points"])
     except (ValueError, KeyError, TypeError) as error:
         raise ValueError(f"{path}: not a list of fakes ({error})") from error
 

@@ -61,6 +61,10 @@ class TrainConfig:
     occupied_weight: float = 1.0  # 1: Eq. 4 as printed; above 1, an occupied pixel counts so many times
     rotate: bool = False  # True: every pair in a heading drawn anew; the paper does not
     gain_spread_db: float = 0.0  # spread of a gain drawn anew for every scan; the paper has none
+    streaks: float = (
+        0.0  # bright streaks added to a scan on average, see `rol.scan_pairs`; the paper adds none
+    )
+    ghosts: float = 0.0  # echoes that appear a second time elsewhere, on average; the paper adds none
     learning_rate: float = 2e-4  # Adam; public default
     beta1: float = (
         0.5  # Adam; public default, lower than Adam's own 0.9 because the two losses chase each other
@@ -445,7 +449,11 @@ def to_tensor(image: np.ndarray) -> Tensor:
 
 
 def generate(
-    generator: ResnetGenerator | UnetGenerator, radar_image: np.ndarray, *, bf16: bool = False
+    generator: ResnetGenerator | UnetGenerator,
+    radar_image: np.ndarray,
+    *,
+    bf16: bool = False,
+    headings: int = 1,
 ) -> np.ndarray:
     """Turn a radar image into a fake lidar image.
 
@@ -460,6 +468,9 @@ def generate(
         Power image of one scan; h and w multiples of 4, and those the network was trained on.
     bf16 : bool
         Multiply in bfloat16: quicker where `has_bf16`.
+    headings : int
+        Quarter turns of the image, 1 to 4, that are translated and averaged before the tanh: what a network draws
+        in one heading only is doubtful. Costs as many times; the paper takes one.
 
     Returns
     -------
@@ -469,7 +480,7 @@ def generate(
     Raises
     ------
     Pix2PixError
-        If the image has another type, shape or size.
+        If the image has another type, shape or size, or the number of headings is none of these.
 
     Notes
     -----
@@ -478,10 +489,17 @@ def generate(
     if radar_image.dtype != np.uint8 or radar_image.ndim != 2:
         raise Pix2PixError(f"radar image: expected uint8 (h, w), got {radar_image.dtype} {radar_image.shape}")
     check_size(radar_image.shape, generator.image_size, "radar image", generator.size_step)
+    if headings not in (1, 2, 3, 4):
+        raise Pix2PixError(f"headings: expected 1 to 4, got {headings}")
     device = next(generator.parameters()).device
     autocast = torch.autocast(device.type, torch.bfloat16) if bf16 else nullcontext()
+    radar = to_tensor(radar_image).to(device)
     with torch.inference_mode(), autocast:
-        fake = generator(to_tensor(radar_image).to(device))[0, 0]  # (h, w)
+        logits = sum(
+            torch.rot90(generator.logits(torch.rot90(radar, turn, (2, 3))), -turn, (2, 3))
+            for turn in range(headings)
+        )
+        fake = torch.tanh(logits / headings)[0, 0]  # (h, w)
     return torch.round((fake.float() + 1.0) * 127.5).to(torch.uint8).cpu().numpy()
 
 

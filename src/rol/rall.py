@@ -8,6 +8,7 @@ lie under a folder that is called `real_root` everywhere, in the layout of the p
 from __future__ import annotations
 
 import os
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -26,6 +27,32 @@ MAP_CORNER = (
 
 class RallError(ValueError):
     """Raised for a file of the real data that is missing or not what it should be; names file and fault."""
+
+
+@dataclass(frozen=True)
+class RealScan:
+    """A real radar scan whose pose on the real map is known.
+
+    Attributes
+    ----------
+    path : Path
+        The file.
+    stamp_us : int
+        Time of its first row [us].
+    codes, azimuths : array, shape (400, b) and (400,)
+        Power codes, and counter-clockwise bearings of the rows [rad].
+    pose : array, shape (3,)
+        Pose of the radar at mid-scan in the frame of the map [m, m, rad].
+    twist : tuple of float, or None
+        Body velocity [m/s, m/s, rad/s]; None where nothing tells it.
+    """
+
+    path: Path
+    stamp_us: int
+    codes: np.ndarray
+    azimuths: np.ndarray
+    pose: np.ndarray
+    twist: tuple[float, float, float] | None
 
 
 def find_real_root(given: str | Path = "") -> Path | None:
@@ -155,6 +182,75 @@ def load_scan_poses(path: Path | str) -> dict[int, np.ndarray]:
         if len(words) != 4 or not np.isfinite(poses[int(words[0])]).all():
             raise RallError(f"{path}: line {number}: expected timestamp_us,x_m,y_m,yaw_rad, all finite")
     return poses
+
+
+def load_scans(real_root: Path | str) -> list[RealScan]:
+    """Read all real radar scans whose pose on the map is known.
+
+    Parameters
+    ----------
+    real_root : path
+        Folder of the real data, see `find_real_root`.
+
+    Returns
+    -------
+    scans : list of RealScan
+        In the order of time: every scan under ``RadarSLAMPy/data/tiny/radar`` with a row in
+        ``oxford_scan_map_poses.csv``. The velocity is that of the official odometry beside the scans; of a scan
+        that it does not cover, that between the poses of neighbours less than a second away, if there is one.
+
+    Raises
+    ------
+    RallError
+        If the poses are missing or at fault, or none of the scans is there.
+    rol.oxford.OxfordError
+        If a scan or the odometry is at fault.
+    """
+    from .oxford import load_radar
+
+    folder, poses = Path(real_root) / SCANS_PATH / "radar", load_scan_poses(Path(real_root) / SCAN_POSES_PATH)
+    stamps = sorted(stamp for stamp in poses if (folder / f"{stamp}.png").is_file())
+    if not stamps:
+        raise RallError(f"{folder}: holds none of the {len(poses)} scans of {SCAN_POSES_PATH}")
+    twists = {
+        **_twists_between(poses),
+        **_official_twists(folder.parent / "gt" / "radar_odometry.csv", stamps),
+    }
+    scans = []
+    for stamp in stamps:
+        path = folder / f"{stamp}.png"
+        scan = load_radar(path)
+        scans.append(RealScan(path, stamp, scan.codes, scan.azimuths, poses[stamp], twists.get(stamp)))
+    return scans
+
+
+def _official_twists(path: Path, stamps: list[int]) -> dict[int, tuple[float, float, float]]:
+    """Velocity of the scans that the official odometry covers; none where its steps are no chain."""
+    from .oxford import compose_odometry, load_radar_odometry
+    from .pairs import estimate_twists
+
+    if not path.is_file():
+        return {}
+    odometry = load_radar_odometry(path)
+    try:
+        known = dict(zip(compose_odometry(odometry)[0].tolist(), estimate_twists(odometry), strict=True))
+    except ValueError:
+        return {}
+    return {stamp: tuple(float(v) for v in known[stamp]) for stamp in stamps if stamp in known}
+
+
+def _twists_between(poses: dict[int, np.ndarray]) -> dict[int, tuple[float, float, float]]:
+    """Velocity of scans from the poses of their neighbours less than a second away."""
+    from .geometry import relative_pose
+
+    stamps, found = sorted(poses), {}
+    for i, stamp in enumerate(stamps):
+        near = [other for other in stamps[max(i - 1, 0) : i + 2] if abs(other - stamp) < 1_000_000]
+        if len(near) > 1:
+            dx, dy, turn = relative_pose(poses[near[0]], poses[near[-1]])
+            c, s, seconds = np.cos(turn / 2.0), np.sin(turn / 2.0), (near[-1] - near[0]) * 1e-6
+            found[stamp] = tuple(float(v) / seconds for v in (c * dx + s * dy, c * dy - s * dx, turn))
+    return found
 
 
 def _load_rows(path: Path | str) -> np.ndarray:

@@ -73,8 +73,16 @@ class ScanPairs:
         """Name the file of the scan."""
         return str(self.session.radar_path(self.jobs[index]["radar_stamp"]))
 
-    def draw(self, index: int, turn: float, gain_db: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
-        """Make one pair, the world turned about the radar, the radar a little deafer or keener.
+    def draw(
+        self,
+        index: int,
+        turn: float,
+        gain_db: float = 0.0,
+        n_streaks: int = 0,
+        n_ghosts: int = 0,
+        rng: np.random.Generator | None = None,
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Make one pair, the world turned about the radar, the radar deafer or keener, or dazzled at some bearings.
 
         Parameters
         ----------
@@ -84,6 +92,10 @@ class ScanPairs:
             Counter-clockwise turn of everything that is seen [rad].
         gain_db : float
             Added to all power that is not zero [dB].
+        n_streaks, n_ghosts : int
+            Streaks and ghosts added, see `add_streaks` and `add_ghosts`.
+        rng : numpy.random.Generator, optional
+            Draws them; needed if there are any.
 
         Returns
         -------
@@ -95,6 +107,10 @@ class ScanPairs:
 
         scan = load_radar(self.session.radar_path(self.jobs[index]["radar_stamp"]))
         codes = shift_codes(scan.codes, gain_db)
+        if n_streaks + n_ghosts > 0:
+            if rng is None:
+                raise ValueError("streaks and ghosts need a generator of random numbers")
+            codes = add_ghosts(add_streaks(codes, n_streaks, rng), n_ghosts, rng)
         radar = turned_radar_image(codes, scan.azimuths, turn, self.jobs[index]["twist"], self.settings)
         c, s = np.cos(turn), np.sin(turn)
         points = self.clouds.cloud(index) @ np.array([[c, s], [-s, c]])
@@ -117,6 +133,83 @@ def shift_codes(codes: np.ndarray, gain_db: float) -> np.ndarray:
     table = np.clip(np.arange(256) + round(2.0 * gain_db), 1, 255).astype(np.uint8)
     table[0] = 0
     return table[codes]
+
+
+def add_streaks(codes: np.ndarray, n: int, rng: np.random.Generator) -> np.ndarray:
+    """Dazzle a scan: a few neighbouring rows are bright along all their length, as behind a very strong reflector.
+
+    Parameters
+    ----------
+    codes : array, shape (a, b), uint8
+        Power codes of half a decibel each.
+    n : int
+        Number of streaks.
+    rng : numpy.random.Generator
+        Draws bearing, width, level, slope, grain and beat of each.
+
+    Returns
+    -------
+    codes : array, shape (a, b), uint8
+        A copy, nowhere darker than before.
+
+    Notes
+    -----
+    The ranges of the draws were read off the eleven real scans: one to five rows, a level of 15 to 43 dB that
+    falls by 1.5 to 5 dB each 13 m, grain like that of any echo, and in half of them echoes that come back every few
+    metres. What is real shines through, so the lidar image stays what it is. Not in the paper.
+    """
+    codes, (n_rows, n_bins) = codes.copy(), codes.shape
+    bins = np.arange(n_bins, dtype=np.float32)
+    for _ in range(n):
+        row, half_width = int(rng.integers(n_rows)), rng.uniform(0.5, 2.2)
+        begin, slope = rng.uniform(60.0, 600.0), rng.uniform(3.0, 10.0) / 300.0
+        level = rng.uniform(30.0, 85.0) - slope * np.maximum(bins - begin, 0.0) - 12.0 * (bins < begin)
+        if rng.random() < 0.5:
+            beat = np.cos(np.pi * bins / rng.uniform(70.0, 350.0) + rng.uniform(0.0, np.pi)) ** 8
+            level += rng.uniform(5.0, 25.0) * (beat - 0.5)
+        for aside in range(-int(np.ceil(half_width)), int(np.ceil(half_width)) + 1):
+            grain = np.interp(bins, bins[::5], 20.0 * np.log10(rng.gamma(0.6, 1.5, len(bins[::5])) + 1e-3))
+            streak = level - 12.0 * (aside / half_width) ** 2 + grain
+            here = (row + aside) % n_rows
+            codes[here] = np.maximum(codes[here], np.clip(streak, 0.0, 250.0).astype(np.uint8))
+    return codes
+
+
+def add_ghosts(codes: np.ndarray, n: int, rng: np.random.Generator) -> np.ndarray:
+    """Let bright echoes appear a second time at another place, as behind a mirror, or a vehicle that has come.
+
+    Parameters
+    ----------
+    codes : array, shape (a, b), uint8
+        Power codes of half a decibel each.
+    n : int
+        Number of ghosts.
+    rng : numpy.random.Generator
+        Draws the echo, its size, where it goes and how much weaker it is there.
+
+    Returns
+    -------
+    codes : array, shape (a, b), uint8
+        A copy, nowhere darker than before.
+
+    Notes
+    -----
+    A lidar sees no ghosts, and a map no vehicles: what stands alone and has no shape should not be trusted. Not in
+    the paper.
+    """
+    found, (n_rows, n_bins) = codes.copy(), codes.shape
+    rows, bins = np.nonzero(codes[:, :1500:4] >= 70)  # within the image, 35 dB
+    for _ in range(n if len(rows) else 0):
+        one = int(rng.integers(len(rows)))
+        half_rows, half_bins = int(rng.integers(1, 6)), int(rng.integers(10, 60))
+        around = (rows[one] + np.arange(-half_rows, half_rows + 1)) % n_rows
+        begin = int(np.clip(4 * bins[one] - half_bins, 0, n_bins - 2 * half_bins))
+        patch = codes[around, begin : begin + 2 * half_bins].astype(np.int64) - int(rng.integers(0, 25))
+        there = (int(rng.integers(n_rows)) + np.arange(len(around))) % n_rows
+        place = int(rng.integers(100, min(1400, n_bins - 2 * half_bins)))
+        kept = found[there, place : place + 2 * half_bins]
+        found[there, place : place + 2 * half_bins] = np.maximum(kept, np.maximum(patch, 0).astype(np.uint8))
+    return found
 
 
 def turned_radar_image(
@@ -250,10 +343,10 @@ class JoinedPairs:
         part, place = self._find(index)
         return part[place]
 
-    def draw(self, index: int, turn: float, gain_db: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
-        """Give a pair turned by an angle [rad], its radar louder by a gain [dB]."""
+    def draw(self, index: int, *changes: Any) -> tuple[np.ndarray, np.ndarray]:
+        """Give a pair with what `ScanPairs.draw` changes: turn, gain, streaks, ghosts and their generator."""
         part, place = self._find(index)
-        return part.draw(place, turn, gain_db)
+        return part.draw(place, *changes)
 
     def name(self, index: int) -> str:
         """Name the file that a pair comes from."""

@@ -63,6 +63,12 @@ class TrainingState:
         self.step = 0
         self.history: list[dict[str, float]] = []
 
+    @property
+    def parts(self) -> list[Any]:
+        """Generator, discriminator and their optimisers, as `rol.pix2pix.train_step` takes them."""
+        names = ("generator", "discriminator")
+        return [both.get(name) for both in (self.networks, self.optimizers) for name in names]
+
     def save(self, path: Path, about: dict[str, Any]) -> None:
         """Write weights and Adam's state as tensors and the scalars as JSON into one file, atomically."""
         from .pix2pix import save_tensors
@@ -158,9 +164,9 @@ def train(
     Parameters
     ----------
     dataset, held_out : sequence of (radar, lidar), each array float32 (1, h, w) in [-1, 1]
-        Pairs to learn from, and pairs that are only looked at. With `config.rotate` or `config.gain_spread_db`
-        the former need a method `draw(index, turn, gain_db)`, see `rol.scan_pairs.ScanPairs`. Where it has a method `name(index)`, errors name
-        the files of a batch by it.
+        Pairs to learn from, and pairs that are only looked at. With `config.rotate`, `config.gain_spread_db`,
+        `config.streaks` or `config.ghosts` the former need a method `draw`, see `rol.scan_pairs.ScanPairs`. Where it has a method
+        `name(index)`, errors name the files of a batch by it.
     config : TrainConfig
         The settings.
     out_dir : path
@@ -197,12 +203,13 @@ def train(
     """
     from .pix2pix import evaluate_l1, save_weights
 
-    size, n_steps = _check_run(dataset, config), config.n_steps(len(dataset))
+    _check_run(dataset, config)
     folder, checkpoint = Path(out_dir), Path(out_dir) / "checkpoint" / "last.safetensors"
     about = {"config": asdict(config), "seed": seed, "pairs": len(dataset), "data": _checksum(dataset)}
+    n_steps = config.n_steps(len(dataset))
     state = TrainingState(config, seed, device)
     generator = state.networks["generator"]
-    generator.image_size = size
+    generator.image_size = _image_size(dataset, generator.size_step)
     if resume and checkpoint.is_file():
         state.load(checkpoint, about)
     while state.step < n_steps:
@@ -233,6 +240,7 @@ def score_points(
     pairs: Any,
     thresholds: Sequence[int] = (128,),
     *,
+    thin: bool = False,
     bf16: bool = False,
 ) -> pd.DataFrame:
     """Measure in metres how good a generator's points are, at several thresholds.
@@ -245,6 +253,8 @@ def score_points(
         Pairs that it did not learn from.
     thresholds : sequence of int
         Smallest grey values that count as a point.
+    thin : bool
+        Keep only the crests of strokes, see `rol.bev.crest_pixels`.
     bf16 : bool
         Multiply in bfloat16.
 
@@ -267,7 +277,10 @@ def score_points(
         radar, lidar = (np.rint((image[0] + 1.0) * 127.5).astype(np.uint8) for image in pairs[index])
         fake, real = generate(generator, radar, bf16=bf16), image_to_points(lidar)
         rows += [
-            {"threshold": level, **similarity_summary(image_to_points(fake, threshold=level), real)}
+            {
+                "threshold": level,
+                **similarity_summary(image_to_points(fake, threshold=level, thin=thin), real),
+            }
             for level in thresholds
         ]
     by_threshold = pd.DataFrame(rows).groupby("threshold")
@@ -283,17 +296,12 @@ def _train_some(
     n_steps, losses = config.n_steps(len(dataset)), []
     device = next(state.networks["generator"].parameters()).device
     steps = range(state.step, min(state.step + config.report_every, n_steps))
-    parts = [
-        both.get(name)
-        for both in (state.networks, state.optimizers)
-        for name in ("generator", "discriminator")
-    ]
     for step, (radar, lidar) in zip(steps, _load_ahead(dataset, config, seed, steps, loaders), strict=True):
         rate = learning_rate(step, n_steps, config.learning_rate)
         for optimizer in state.optimizers.values():
             optimizer.param_groups[0]["lr"] = rate
         try:
-            losses.append(train_step(*parts, radar.to(device), lidar.to(device), config))
+            losses.append(train_step(*state.parts, radar.to(device), lidar.to(device), config))
         except Pix2PixError as error:
             batch = pick_pairs(step, len(dataset), config.batch, seed)
             names = ", ".join(
@@ -312,16 +320,18 @@ def _load_ahead(
     """Give the batches of some steps, each loaded while the one before is learnt from."""
     import torch
 
-    is_drawn = config.rotate or config.gain_spread_db > 0.0
+    is_drawn = _is_drawn(config)
 
     def load(step: int) -> tuple[Tensor, Tensor]:
         batch = pick_pairs(step, len(dataset), config.batch, seed)
         rng = np.random.default_rng([seed, step, 1])
         turns = rng.uniform(-np.pi, np.pi, len(batch)) * config.rotate
         gains = rng.normal(0.0, 1.0, len(batch)) * config.gain_spread_db
+        false = rng.poisson((config.streaks, config.ghosts), (len(batch), 2))
+        drawn = zip(batch, turns, gains, false, rng.spawn(len(batch)), strict=True)
         pairs = [
-            dataset.draw(int(index), float(turn), float(gain)) if is_drawn else dataset[int(index)]
-            for index, turn, gain in zip(batch, turns, gains, strict=True)
+            dataset.draw(int(i), float(turn), float(gain), *map(int, n), own) if is_drawn else dataset[int(i)]
+            for i, turn, gain, n, own in drawn
         ]
         radar, lidar = (torch.from_numpy(np.stack(side)) for side in zip(*pairs, strict=True))
         return radar, lidar
@@ -335,23 +345,34 @@ def _load_ahead(
             yield radar, lidar
 
 
-def _check_run(dataset: Any, config: TrainConfig) -> tuple[int, int]:
-    """Refuse what cannot be trained on, and give the size of the images."""
-    from .pix2pix import check_size
+def _is_drawn(config: TrainConfig) -> bool:
+    """Say whether pairs are changed at random before they are learnt from."""
+    return config.rotate or max(config.gain_spread_db, config.streaks, config.ghosts) > 0.0
 
+
+def _check_run(dataset: Any, config: TrainConfig) -> None:
+    """Refuse what cannot be trained on."""
     if len(dataset) == 0:
         raise TrainingError("no pairs to train on")
     if min(config.batch, config.report_every, config.n_steps(len(dataset))) < 1:
         raise TrainingError("batch, report_every and the number of steps must be at least 1")
     if config.pixel_loss not in ("l1", "entropy"):
         raise TrainingError(f"pixel_loss must be 'l1' or 'entropy', not {config.pixel_loss!r}")
-    if (config.rotate or config.gain_spread_db > 0.0) and not hasattr(dataset, "draw"):
-        raise TrainingError("rotate and gain_spread_db need pairs that are drawn, see rol.scan_pairs")
+    if _is_drawn(config) and not hasattr(dataset, "draw"):
+        raise TrainingError(
+            "rotate, gain_spread_db, streaks and ghosts need pairs that are drawn, see rol.scan_pairs"
+        )
     if config.checkpoint_every % config.report_every:
         every = (config.checkpoint_every, config.report_every)
         raise TrainingError(f"checkpoint_every ({every[0]}) is no multiple of report_every ({every[1]})")
+
+
+def _image_size(dataset: Any, step: int) -> tuple[int, int]:
+    """Give the size of the images, which must be multiples of a step."""
+    from .pix2pix import check_size
+
     height, width = dataset[0][0].shape[-2:]
-    check_size((height, width), None, "first pair", 32 if config.network == "unet" else 4)
+    check_size((height, width), None, "first pair", step)
     return int(height), int(width)
 
 

@@ -55,10 +55,6 @@ class UnetGenerator(nn.Module):
 
     def __init__(self, filters: int, blocks: int) -> None:
         super().__init__()
-        if filters < 1 or blocks < 0:
-            raise ValueError(
-                f"generator: filters must be at least 1 and blocks at least 0: {filters}, {blocks}"
-            )
         self.filters, self.blocks, self.image_size = filters, blocks, None
         c = [filters * width for width in WIDTHS]
         self.first = _Conv(FOLD * FOLD + 1, c[0])

@@ -6,6 +6,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pandas as pd
 import pytest
 
 from chapters import (
@@ -44,6 +45,15 @@ def check_localization(folder: Path, session: str, method: str) -> dict:
         rows = [line for line in (folder / name).read_text().splitlines() if not line.startswith("#")]
         assert len(rows) == metrics["n_scans"] and all(len(row.split()) == 8 for row in rows), name
     return metrics
+
+
+def test_every_real_scan_is_judged(profile: dict, real_root: Path) -> None:
+    rows = pd.read_csv(Path(profile["out_dir"], "real_radar", "scans.csv"))
+    shares = ["share_1m_raw", "share_2m_raw", "share_1m_fake", "share_2m_fake"]
+    assert {"timestamp_us", *shares} <= set(rows.columns)
+    stamps = {int(path.stem) for path in (real_root / "RadarSLAMPy/data/tiny/radar").glob("*.png")}
+    assert set(rows["timestamp_us"]) == stamps
+    assert rows[shares].stack().between(0.0, 1.0).all()
 
 
 @pytest.mark.parametrize("profile", ["smoke"], indirect=True)

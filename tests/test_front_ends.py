@@ -1,0 +1,101 @@
+"""From a polar scan to points: detectors and networks in one frame, and the judge with the map."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial import cKDTree
+
+from rol import front_ends
+from rol.front_ends import Translator, detect_points, judge_on_map
+
+AZIMUTHS = -2.0 * np.pi * (13 + 14 * np.arange(400)) / 5600
+
+
+def scan_with_spot(bearing: float, range_m: float, code: int = 140) -> np.ndarray:
+    """A quiet scan with one bright echo."""
+    codes = np.full((400, 3768), 6, dtype=np.uint8)
+    row = int(np.argmin(np.abs(np.angle(np.exp(1j * (AZIMUTHS - bearing))))))
+    bin_ = round((range_m + 0.31) / 0.0438 - 0.5)
+    codes[row, bin_ - 1 : bin_ + 2] = code - 20
+    codes[row, bin_] = code
+    return codes
+
+
+@pytest.mark.parametrize("detector", front_ends.DETECTORS)
+def test_both_detectors_find_a_spot_where_it_is(detector: str) -> None:
+    points = detect_points(scan_with_spot(0.8, 30.0), AZIMUTHS, detector=detector)
+    assert points.shape == (1, 2)
+    assert np.hypot(*(points[0] - 30.0 * np.array([np.cos(0.8), np.sin(0.8)]))) < 0.3
+
+
+@pytest.mark.parametrize("detector", front_ends.DETECTORS)
+@pytest.mark.parametrize("range_m", [1.5, 70.0])
+def test_leakage_and_what_lies_beyond_the_image_are_left_out(detector: str, range_m: float) -> None:
+    assert len(detect_points(scan_with_spot(0.8, range_m), AZIMUTHS, detector=detector)) == 0
+
+
+def test_motion_moves_points_to_mid_scan() -> None:
+    codes = scan_with_spot(-0.1, 30.0)  # seen at the very beginning of the turn
+    still, moving = (detect_points(codes, AZIMUTHS, twist)[0] for twist in (None, (10.0, 0.0, 0.0)))
+    # The car has another eighth of a second to go, and the echo ahead read 0.49 m too near.
+    assert moving[0] - still[0] == pytest.approx(-1.25 + 0.49, abs=0.1)
+
+
+def test_other_bins_are_an_argument() -> None:
+    codes = np.full((400, 576), 6, dtype=np.uint8)
+    codes[100, 115] = 140
+    point = detect_points(codes, AZIMUTHS, range_resolution=0.17361, range_offset=0.0)[0]
+    assert np.hypot(*point) == pytest.approx(115.5 * 0.17361)
+
+
+def test_unknown_detectors_are_refused() -> None:
+    with pytest.raises(ValueError, match="'best' is none of k-strongest, cfar"):
+        detect_points(scan_with_spot(0.0, 9.0), AZIMUTHS, detector="best")
+
+
+def test_shares_on_a_map_by_hand() -> None:
+    pose = np.array([100.0, 50.0, np.pi / 2])  # forward is along y of the map
+    points = np.array([[10.0, 0.0], [10.0, 1.5], [20.0, 0.0], [30.0, 0.0]])
+    tree = cKDTree([[100.0, 60.0], [100.5, 70.0]])
+    judged = judge_on_map(points, pose, tree)
+    assert judged == {"n": 4, "share_1m": 0.5, "share_2m": 0.75}
+    nothing = judge_on_map(np.zeros((0, 2)), pose, tree)
+    assert nothing["n"] == 0 and np.isnan(nothing["share_1m"])
+
+
+@pytest.mark.torch
+def test_translated_scan_stands_where_the_scan_shows_it(tmp_path: Path) -> None:
+    torch = pytest.importorskip("torch")
+    from rol.pix2pix import build_generator, save_weights
+
+    generator = build_generator(2, 1, rng=torch.Generator().manual_seed(1))
+    generator.image_size = (512, 512)
+    path = tmp_path / "net.safetensors"
+    save_weights(path, generator, {"points": {"threshold": 140}, "pairs_settings": {"motion": "corrected"}})
+    read = front_ends.load_translator(path)
+    assert read.points == {"threshold": 140, "thin": False} and read.settings == {"motion": "corrected"}
+    assert read.about["filters"] == 2
+
+    class Copy(torch.nn.Module):
+        """Gives back what it gets."""
+
+        image_size, size_step = (512, 512), 4
+
+        def __init__(self) -> None:
+            super().__init__()
+            self.weight = torch.nn.Parameter(torch.zeros(1))
+
+        def logits(self, radar: torch.Tensor) -> torch.Tensor:
+            return torch.atanh(radar * 0.999)
+
+    codes, copy = scan_with_spot(0.8, 30.0, 255), Translator(Copy(), {"threshold": 60}, {}, {})
+    points, radar_image, fake_image = front_ends.translate_scan(copy, codes, AZIMUTHS)
+    assert np.abs(radar_image.astype(int) - fake_image).max() <= 1
+    np.testing.assert_array_equal(front_ends.translate_scan(copy, codes, AZIMUTHS, headings=4)[2], fake_image)
+    raw = detect_points(codes, AZIMUTHS)[0]
+    assert len(points) and np.hypot(*(points.mean(axis=0) - raw)) < 0.3
+    fewer, *_ = front_ends.translate_scan(copy, codes, AZIMUTHS, points={"threshold": int(fake_image.max())})
+    assert 0 < len(fewer) < len(points)
+    near = front_ends.translate_scan(copy, scan_with_spot(0.8, 1.5, 255), AZIMUTHS)[0]
+    assert len(near) == 0
