@@ -80,7 +80,7 @@ def test_translated_scan_stands_where_the_scan_shows_it(tmp_path: Path) -> None:
     class Copy(torch.nn.Module):
         """Gives back what it gets."""
 
-        image_size, size_step = (512, 512), 4
+        image_size, size_step, headings = (512, 512), 4, 1
 
         def __init__(self) -> None:
             super().__init__()

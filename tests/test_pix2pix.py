@@ -217,7 +217,7 @@ def test_held_out_l1_is_the_mean_over_pairs() -> None:
 class Same(nn.Module):
     """A network that gives its input back."""
 
-    image_size, size_step = None, 4
+    image_size, size_step, headings = None, 4, 1
 
     def __init__(self) -> None:
         super().__init__()
@@ -273,6 +273,15 @@ def test_headings_are_averaged_and_turned_back() -> None:
     assert not np.array_equal(generate(generator, image), generate(generator, image, headings=4))
     with pytest.raises(Pix2PixError, match="headings: expected 1 to 4, got 5"):
         generate(generator, image, headings=5)
+
+
+def test_number_of_headings_is_kept_with_the_weights(tmp_path: Path) -> None:
+    generator, image = tiny_generator().eval(), radar_image()
+    assert generator.headings == 1
+    generator.headings = 4
+    save_weights(tmp_path / "g.safetensors", generator)
+    read = load_weights(tmp_path / "g.safetensors")
+    np.testing.assert_array_equal(generate(read, image), generate(tiny_generator(), image, headings=4))
 
 
 def test_generate_is_the_function_that_training_saw() -> None:

@@ -23,6 +23,7 @@ def test_weights_are_small_and_have_a_card_that_fits(path: Path) -> None:
     card, translator = json.loads(path.with_suffix(".json").read_text()), load_translator(path)
     assert translator.about["card"] == path.with_suffix(".json").name and card["name"] == path.stem
     assert translator.points == {"threshold": card["threshold"], "thin": card["thin"]}
+    assert translator.generator.headings == card["headings"] == card["recipe"]["network"].get("headings", 1)
     assert translator.settings == card["recipe"]["pairs"]
     for key, value in card["recipe"]["network"].items():
         if key in translator.about["config"]:

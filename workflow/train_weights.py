@@ -40,7 +40,22 @@ LICENCE = (
     "MIT; learnt from simulated data, partly in a world grown from the lidar map of RaLL (Yin et al. 2021)"
 )
 TOLERANCE = 0.01  # of a share, between processors
-LEVELS = (64, 96, 112, 128, 144, 160, 176, 192, 208, 224)  # grey values at which points are judged
+LEVELS = (
+    64,
+    96,
+    112,
+    128,
+    136,
+    144,
+    152,
+    160,
+    168,
+    176,
+    184,
+    192,
+    208,
+    224,
+)  # grey values at which points are judged
 
 
 def say(line: str) -> None:
@@ -173,7 +188,11 @@ def run_network(
     from rol.pix2pix import TrainConfig, has_bf16
     from rol.training import train
 
-    own = {key: value for key, value in asked.items() if key not in ("learn", "reach", "seed", "thin")}
+    own = {
+        key: value
+        for key, value in asked.items()
+        if key not in ("headings", "learn", "reach", "seed", "thin")
+    }
     unknown = set(own) - {field.name for field in fields(TrainConfig)}
     if unknown:
         raise ValueError(f"{given.recipe}: {name}: no such setting: {min(unknown)}")
@@ -190,6 +209,7 @@ def run_network(
         on_report=lambda row, _: say(f"{name}: " + " ".join(f"{key} {value:.5g}" for key, value in row.items())),
     )  # fmt: skip
     seconds = time.perf_counter() - begin
+    generator.headings = asked.get("headings", 1)
     thin = bool(asked.get("thin", False))
     judged = judge(generator, sets, real, recipe["pairs"], thin)
     threshold = choose_threshold(judged, asked.get("reach"))
@@ -201,6 +221,7 @@ def run_network(
         "name": name,
         "threshold": threshold,
         "thin": thin,
+        "headings": generator.headings,
         "recipe": {**{key: recipe[key] for key in ("seed", "pairs", "worlds", "sets")}, "network": asked},
         "pairs": {part: len(pairs) for part, pairs in sets.items()},
         "weights": sum(weight.numel() for weight in generator.parameters()),

@@ -82,7 +82,7 @@ def translate_scan(
     points: dict[str, Any] | None = None,
     min_range_m: float = MIN_RANGE_M,
     bf16: bool = False,
-    headings: int = 1,
+    headings: int | None = None,
     **changes: Any,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Turn a polar scan into fake lidar points.
@@ -101,8 +101,8 @@ def translate_scan(
         Points nearer than this are dropped [m].
     bf16 : bool
         Multiply in bfloat16, see `rol.pix2pix.has_bf16`.
-    headings : int
-        Quarter turns to average, see `rol.pix2pix.generate`.
+    headings : int, optional
+        Quarter turns to average, see `rol.pix2pix.generate`; the network's own number if not given.
     **changes
         Settings of the image that differ from the translator's, such as ``range_resolution`` of another radar.
 

@@ -110,9 +110,12 @@ class ResnetGenerator(nn.Module):
         Width of the first layer and number of residual blocks.
     image_size : tuple of int or None
         Height and width it was trained on; ``generate`` refuses any other. None: not trained yet.
+    headings : int
+        Quarter turns of an image that ``generate`` averages, 1 to 4; kept with the weights. The paper takes one.
     """
 
     size_step = 4  # height and width must be multiples of it
+    headings = 1
 
     def __init__(self, filters: int, blocks: int) -> None:
         super().__init__()
@@ -453,7 +456,7 @@ def generate(
     radar_image: np.ndarray,
     *,
     bf16: bool = False,
-    headings: int = 1,
+    headings: int | None = None,
 ) -> np.ndarray:
     """Turn a radar image into a fake lidar image.
 
@@ -468,9 +471,9 @@ def generate(
         Power image of one scan; h and w multiples of 4, and those the network was trained on.
     bf16 : bool
         Multiply in bfloat16: quicker where `has_bf16`.
-    headings : int
+    headings : int, optional
         Quarter turns of the image, 1 to 4, that are translated and averaged before the tanh: what a network draws
-        in one heading only is doubtful. Costs as many times; the paper takes one.
+        in one heading only is doubtful. Costs as many times; the paper takes one. Not given: the network's own number.
 
     Returns
     -------
@@ -489,6 +492,7 @@ def generate(
     if radar_image.dtype != np.uint8 or radar_image.ndim != 2:
         raise Pix2PixError(f"radar image: expected uint8 (h, w), got {radar_image.dtype} {radar_image.shape}")
     check_size(radar_image.shape, generator.image_size, "radar image", generator.size_step)
+    headings = generator.headings if headings is None else headings
     if headings not in (1, 2, 3, 4):
         raise Pix2PixError(f"headings: expected 1 to 4, got {headings}")
     device = next(generator.parameters()).device
@@ -538,6 +542,7 @@ def save_weights(
         "filters": generator.filters,
         "blocks": generator.blocks,
         "image_size": generator.image_size,
+        "headings": generator.headings,
         "torch": str(torch.__version__),
     }
     tensors = {name: value.half() if half else value for name, value in generator.state_dict().items()}
@@ -585,6 +590,7 @@ def load_weights(
     except RuntimeError as error:
         raise Pix2PixError(f"{path}: tensors do not fit the header's architecture ({error})") from error
     generator.image_size = None if about["image_size"] is None else tuple(about["image_size"])
+    generator.headings = int(about.get("headings", 1))
     if network == "unet":
         from .unet import fuse
 

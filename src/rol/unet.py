@@ -47,11 +47,12 @@ class UnetGenerator(nn.Module):
     ----------
     filters, blocks : int
         Channels of the first level, and residual blocks on each level and side.
-    image_size : tuple of int or None
-        Height and width it was trained on; ``generate`` refuses any other. None: not trained yet.
+    image_size, headings
+        As in `rol.pix2pix.ResnetGenerator`.
     """
 
     size_step = 32  # height and width must be multiples of it
+    headings = 1
 
     def __init__(self, filters: int, blocks: int) -> None:
         super().__init__()
