@@ -385,3 +385,80 @@ def test_defaults_are_the_documented_ones():
     text = mcl.MclSettings.__doc__
     assert f"{settings.n_particles}:" in text and f"lambda of Eq. 8. {settings.exponent:.0f}:" in text
     assert f"[m]. {settings.d_th_m:.1f}:" in text
+
+
+def count_plainly(particles, points, values, origin, cell):
+    """Sum the values under the points in plain NumPy, all pairs at once."""
+    c, s = np.cos(particles[:, 2:]), np.sin(particles[:, 2:])
+    x = particles[:, :1] + c * points[:, 0] - s * points[:, 1]
+    y = particles[:, 1:2] + s * points[:, 0] + c * points[:, 1]
+    i, j = np.floor((x - origin[0]) / cell).astype(int), np.floor((y - origin[1]) / cell).astype(int)
+    is_inside = (i >= 0) & (i < values.shape[0]) & (j >= 0) & (j < values.shape[1])
+    return np.sum(np.where(is_inside, values[i * is_inside, j * is_inside], 0), axis=1, dtype=np.int64)
+
+
+@pytest.mark.parametrize("parallel", [False, True])
+@pytest.mark.parametrize("n", [1, 3, 200])
+@pytest.mark.parametrize("m", [0, 1, 7, 333])
+@pytest.mark.parametrize("middle", [0.0, 60.0, 500.0])  # amid the grid, about its corner, far outside
+def test_count_matches_equals_plain_numpy(n, m, middle, parallel):
+    rng = np.random.default_rng([n, m, int(middle)])
+    values, origin, cell = rng.integers(0, 256, (470, 510), dtype=np.uint8), np.array([-59.0, -63.0]), 0.25
+    values[0, 0] = 255  # the cell that stands in for those outside
+    particles = rng.uniform((-30, -30, -4), (30, 30, 4), (n, 3)) + (middle, -middle, 0.0)
+    points = rng.uniform(-60, 60, (m, 2))
+    for grid in (values, values > 128):
+        expected = count_plainly(particles, points, grid, origin, cell)
+        got = mcl.count_matches(particles, points, grid, origin, cell, parallel=parallel)
+        assert got.dtype == np.int64
+        np.testing.assert_array_equal(got, expected)
+        assert expected.any() == (middle < 500.0) or m < 300
+
+
+def test_count_matches_far_from_the_origin_on_fine_cells():
+    # kilometres from the origin on cells of an eighth of a metre, where 32 bits would round points into the next cell
+    rng = np.random.default_rng(3)
+    values, origin, cell = rng.random((2400, 2400)) < 0.5, np.array([1400.0, -1700.0]), 0.125
+    particles = rng.uniform((1500, -1600, -4), (1600, -1500, 4), (300, 3))
+    points = rng.uniform(-45, 45, (2000, 2))
+    got = mcl.count_matches(particles, points, values, origin, cell)
+    np.testing.assert_array_equal(got, count_plainly(particles, points, values, origin, cell))
+
+
+def test_points_on_an_edge_belong_to_the_cell_above():
+    # cells are half-open: the lower edge belongs to the grid, the upper one does not
+    values = np.array([[1, 2, 4], [8, 16, 32]], dtype=np.uint8)
+    corners = np.array([[i, j] for i in range(3) for j in range(4)], dtype=float)
+    got = [mcl.count_matches(np.zeros((1, 3)), corner[None], values, ORIGIN, 1.0)[0] for corner in corners]
+    assert got == [1, 2, 4, 0, 8, 16, 32, 0, 0, 0, 0, 0]
+    below = np.array([[-1e-9, 0.5], [0.5, -1e-9], [-0.5, -0.5]])  # cut towards zero they would be inside
+    assert mcl.count_matches(np.zeros((1, 3)), below, values, ORIGIN, 1.0).tolist() == [0]
+
+
+@pytest.mark.parametrize("parallel", [False, True])
+def test_count_matches_takes_any_layout_and_leaves_it_as_it_was(parallel):
+    rng = np.random.default_rng(4)
+    values = rng.integers(0, 2, (90, 120), dtype=np.uint8)
+    wide, tall = rng.uniform(0, 20, (40, 6)), rng.uniform(-8, 8, (4, 60))
+    particles, points = wide[::2, ::2], tall[1:3].T
+    for grid in (values[::2, 5:80], values.T, np.asfortranarray(values), values[::-1].astype(bool)):
+        before = [a.copy() for a in (wide, tall, values)]
+        got = mcl.count_matches(particles, points, grid, (0.5, -0.5), 0.25, parallel=parallel)
+        np.testing.assert_array_equal(got, count_plainly(particles, points, grid, (0.5, -0.5), 0.25))
+        for was, now in zip(before, (wide, tall, values), strict=True):
+            np.testing.assert_array_equal(was, now)
+
+
+def test_count_matches_reads_a_grid_that_is_read_only():
+    read_only = np.frombuffer(MATCHED.tobytes(), dtype=np.uint8).reshape(5, 5)
+    assert mcl.count_matches(np.array([[0.5, 2.5, 0.0]]), CLOUD, read_only, ORIGIN, 1.0).tolist() == [3]
+
+
+@pytest.mark.parametrize("parallel", [False, True])
+def test_count_matches_of_nothing(parallel):
+    two, none = np.zeros((2, 3)), np.zeros((0, 2))
+    for shape in ((0, 0), (0, 5), (5, 0)):  # a grid without a cell: everything is outside
+        empty = np.zeros(shape, dtype=bool)
+        assert mcl.count_matches(two, CLOUD, empty, ORIGIN, 1.0, parallel=parallel).tolist() == [0, 0]
+    assert mcl.count_matches(two, none, MATCHED, ORIGIN, 1.0, parallel=parallel).tolist() == [0, 0]
+    assert mcl.count_matches(two[:0], CLOUD, MATCHED, ORIGIN, 1.0, parallel=parallel).shape == (0,)

@@ -261,19 +261,27 @@ def build_grid(map_points: np.ndarray, settings: MclSettings) -> MapGrid:
 def _sum_values(particles, points, values, x0, y0, cell):
     """Sum the grid's values under the points as seen from each particle.
 
-    Points outside, particles inside: one point falls on neighbouring cells for all particles of a tracked pose, so
-    the cells that are asked stay in the processor's cache.
+    Two loops for each particle, neither with a branch: the first finds the points' cells, several at once in the
+    processor's wide registers, the second only reads them. A point outside the grid is read at the first cell, whose
+    value is taken off the sum again.
     """
-    h, w = values.shape
-    sums = np.zeros(particles.shape[0], dtype=np.int64)
-    c, s = np.cos(particles[:, 2]) / cell, np.sin(particles[:, 2]) / cell
-    u0, v0 = (particles[:, 0] - x0) / cell, (particles[:, 1] - y0) / cell
-    for k in range(points.shape[0]):
-        x, y = points[k, 0], points[k, 1]
-        for i in range(particles.shape[0]):
-            u, v = u0[i] + c[i] * x - s[i] * y, v0[i] + s[i] * x + c[i] * y
-            if 0.0 <= u < h and 0.0 <= v < w:
-                sums[i] += values[int(u), int(v)]
+    h, w = np.int32(values.shape[0]), np.int32(values.shape[1])  # 64 bits would be converted one by one
+    flat, cells = values.ravel(), np.empty(points.shape[0], dtype=np.int64)
+    x, y = points[:, 0].copy(), points[:, 1].copy()
+    sums = np.empty(particles.shape[0], dtype=np.int64)
+    for i in range(particles.shape[0]):
+        c, s = np.cos(particles[i, 2]) / cell, np.sin(particles[i, 2]) / cell
+        u0, v0 = (particles[i, 0] - x0) / cell, (particles[i, 1] - y0) / cell
+        n_outside = 0
+        for k in range(cells.shape[0]):
+            u, v = u0 + c * x[k] - s * y[k], v0 + s * x[k] + c * y[k]
+            is_inside = (u >= 0.0) & (u < h) & (v >= 0.0) & (v < w)
+            cells[k] = np.int64(np.int32(u)) * np.int64(w) + np.int32(v) if is_inside else 0
+            n_outside += not is_inside
+        total = -n_outside * np.int64(flat[0])
+        for k in range(cells.shape[0]):
+            total += flat[np.uint64(cells[k])]  # unsigned, or numba lets negative numbers count from the end
+        sums[i] = total
     return sums
 
 
@@ -307,7 +315,7 @@ def count_matches(
         Cloud in the radar frame [m].
     matched : array of bool or uint8, shape (h, w)
         1 for cells closer than d_th to the map, see `build_matched_grid`; other values are summed up, see
-        `build_likelihood_grid`.
+        `build_likelihood_grid`. Contiguous; any other is copied first.
     origin : array-like, shape (2,)
         Corner of cell [0, 0] with the smallest x and y [m].
     cell : float
@@ -325,7 +333,10 @@ def count_matches(
         raise MclError(
             f"matched: expected a 2D grid of bool or uint8, got {matched.ndim}D of {matched.dtype}"
         )
-    given = particles, points, matched.view(np.uint8), float(origin[0]), float(origin[1]), float(cell)
+    if matched.size == 0:
+        return np.zeros(len(particles), dtype=np.int64)
+    values, particles = np.ascontiguousarray(matched).view(np.uint8), np.ascontiguousarray(particles)
+    given = particles, points, values, float(origin[0]), float(origin[1]), float(cell)
     return _sum_values_parallel(*given, get_num_threads()) if parallel else _sum_values(*given)
 
 
