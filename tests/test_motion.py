@@ -1,0 +1,75 @@
+"""What odometry is worth: the scale, the noise and the outliers of steps whose truth is known."""
+
+import numpy as np
+import pytest
+
+from rol import rall
+from rol.geometry import relative_pose
+from rol.motion import MotionModel, correct_step, learn_motion, sample_motion
+
+
+def drive(rng: np.random.Generator, n: int = 4000) -> np.ndarray:
+    """True steps of a car that stands a quarter of the time, and drives bends otherwise."""
+    speed = np.where(np.arange(n) % 400 < 100, 0.0, 1.0 + 0.5 * np.sin(np.arange(n) / 60.0))
+    turn = 0.05 * speed * np.sin(np.arange(n) / 25.0)
+    return np.column_stack([speed, 1.2 * turn, turn])
+
+
+def test_scale_and_noise_are_found() -> None:
+    rng = np.random.default_rng(1)
+    true = drive(rng)
+    told = true * (0.98, 1.0, 1.0) + rng.normal(0.0, (0.05, 0.02, 0.002), true.shape)
+    told[::97, 0] += 1.5  # one gross error in a hundred
+    model = learn_motion(told, true)
+    assert model.matrix[0][0] == pytest.approx(1.0 / 0.98, abs=0.005)
+    assert model.matrix[2][2] == pytest.approx(1.0, abs=0.03)
+    assert model.still[0] == pytest.approx(0.05, rel=0.5) and model.still[2] == pytest.approx(0.002, rel=0.5)
+
+
+def test_errors_that_go_on_count_as_what_they_become() -> None:
+    rng = np.random.default_rng(2)
+    true = drive(rng)
+    once = rng.normal(0.0, 0.05, len(true))
+    lasting = np.convolve(rng.normal(0.0, 0.05, len(true)), np.ones(4) / 2.0, mode="same")  # as large a step
+    models = [
+        learn_motion(true + np.column_stack([error, 0 * error, 0 * error]), true) for error in (once, lasting)
+    ]
+    assert models[1].still[0] > 1.5 * models[0].still[0]
+
+
+def test_a_step_is_corrected_and_its_noise_drawn() -> None:
+    model = MotionModel(
+        ((1.1, 0.0, 0.0), (0.0, 0.0, 2.0), (0.0, 0.0, 1.0)), (0.1, 0.0, 0.0), (0.1, 0.0, 0.0), 0.0, 1.0
+    )
+    np.testing.assert_allclose(correct_step(np.array([2.0, 9.0, 0.1]), model), [2.2, 0.2, 0.1])
+    start = np.tile([5.0, 5.0, np.pi / 2.0], (20_000, 1))
+    moved = sample_motion(start, np.array([2.0, 0.0, 0.0]), model, np.random.default_rng(3))
+    assert moved[:, 1].mean() == pytest.approx(7.2, abs=0.01) and moved[:, 0] == pytest.approx(5.0)
+    assert moved[:, 1].std() == pytest.approx(0.1 + 2.2 * 0.1, rel=0.03)  # still, and for each metre driven
+
+
+def test_a_share_of_the_particles_takes_the_noise_of_an_outlier() -> None:
+    model = MotionModel(
+        still=(0.01, 0.0, 0.0), moving=(0.0, 0.0, 0.0), outlier_share=0.1, outlier_scale=100.0
+    )
+    moved = sample_motion(np.zeros((20_000, 3)), np.zeros(3), model, np.random.default_rng(4))
+    assert np.mean(np.abs(moved[:, 0]) > 0.05) == pytest.approx(0.096, abs=0.01)
+
+
+def test_steps_that_do_not_belong_together_are_refused() -> None:
+    with pytest.raises(ValueError, match="40 steps for 39 true ones"):
+        learn_motion(np.zeros((40, 3)), np.zeros((39, 3)))
+    with pytest.raises(ValueError, match="at least 32 needed"):
+        learn_motion(np.zeros((20, 3)), np.zeros((20, 3)))
+    with pytest.raises(ValueError, match="not finite"):
+        learn_motion(np.full((40, 3), np.nan), np.zeros((40, 3)))
+
+
+def test_the_real_odometry_is_short_by_one_and_a_half_per_cent(real_root) -> None:
+    found = []
+    for number in ("01", "02", "07"):
+        poses = rall.load_poses(real_root / rall.POSES_PATH / f"pose_xy_{number}.txt")
+        true = relative_pose(poses[:-1], poses[1:])
+        told = rall.load_odometry(real_root / rall.ODOMETRY_PATH / f"seq{number}_odom.txt")[: len(true)]
+        found.append(learn_motion(told, true).matrix[0][0])
+    np.testing.assert_allclose(found, 1.0 / 0.985, atol=0.003)
