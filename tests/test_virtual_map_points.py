@@ -32,9 +32,8 @@ def test_what_is_seen_is_in_the_frame_of_the_radar_and_within_its_reach() -> Non
 def test_kinds_are_mixed_so_that_the_shares_come_out() -> None:
     shares = np.array([[1.0, 0.0, 0.3], [1.0, 1.0, 0.5]])
     parts = mix_kinds(shares, 0.4, 0.6)
-    np.testing.assert_allclose(
-        parts, [0.175, 0.075, 0.75]
-    )  # 0.175 + 0.3 * 0.75 = 0.4, 0.25 + 0.5 * 0.75 = 0.625 - 0.025
+    # 0.16 + 0.3 * 0.8 = 0.4, and 0.16 + 0.04 + 0.5 * 0.8 = 0.6
+    np.testing.assert_allclose(parts, [0.16, 0.04, 0.8])
     with pytest.raises(
         MapPointsError, match="0.10 within 1 m and 0.20 within 2 m here: it would need near -0"
     ):

@@ -40,22 +40,8 @@ LICENCE = (
     "MIT; learnt from simulated data, partly in a world grown from the lidar map of RaLL (Yin et al. 2021)"
 )
 TOLERANCE = 0.01  # of a share, between processors
-LEVELS = (
-    64,
-    96,
-    112,
-    128,
-    136,
-    144,
-    152,
-    160,
-    168,
-    176,
-    184,
-    192,
-    208,
-    224,
-)  # grey values at which points are judged
+# Grey values at which points are judged.
+LEVELS = (64, 96, 112, *range(128, 193, 8), 208, 224)
 
 
 def say(line: str) -> None:
@@ -188,11 +174,8 @@ def run_network(
     from rol.pix2pix import TrainConfig, has_bf16
     from rol.training import train
 
-    own = {
-        key: value
-        for key, value in asked.items()
-        if key not in ("headings", "learn", "reach", "seed", "thin")
-    }
+    elsewhere = ("headings", "learn", "reach", "seed", "thin")
+    own = {key: value for key, value in asked.items() if key not in elsewhere}
     unknown = set(own) - {field.name for field in fields(TrainConfig)}
     if unknown:
         raise ValueError(f"{given.recipe}: {name}: no such setting: {min(unknown)}")
