@@ -192,9 +192,11 @@ def run_network(
         on_report=lambda row, _: say(f"{name}: " + " ".join(f"{key} {value:.5g}" for key, value in row.items())),
     )  # fmt: skip
     seconds = time.perf_counter() - begin
-    generator.headings = asked.get("headings", 1)
     thin = bool(asked.get("thin", False))
-    judged = judge(generator, sets, real, recipe["pairs"], thin)
+    as_driven = judged = judge(generator, sets, real, recipe["pairs"], thin)
+    if asked.get("headings", 1) > 1:
+        generator.headings = asked["headings"]
+        judged = judge(generator, sets, real, recipe["pairs"], thin)
     threshold = choose_threshold(judged, asked.get("reach"))
     about = {
         "name": name, "config": asdict(config), "seed": seed, "card": f"{name}.json",
@@ -215,6 +217,7 @@ def run_network(
         "device": given.device,
         "licence": LICENCE,
         "judged": as_lists(judged),
+        "judged_one_heading": as_lists(as_driven),
         "history": as_lists(history.round(6)),
     }
     return generator, about, card
