@@ -7,11 +7,16 @@ import pytest
 
 from rol.evaluation import (
     METRICS,
+    NEES_95,
     EvaluationError,
     FailureRule,
     FailureWatch,
+    consistency,
     drift,
+    drift_by_length,
+    error_figures,
     pose_errors,
+    pose_nees,
     read_metrics,
     read_tum,
     rmse,
@@ -95,6 +100,138 @@ def test_drift_of_a_scale_error():
     steps = np.tile((1.0, 0.0, 0.0), (300, 1))
     assert drift(accumulate_steps(steps * 0.97), accumulate_steps(steps)) == pytest.approx(0.03)
     assert np.isnan(drift(accumulate_steps(steps[:50]), accumulate_steps(steps[:50])))
+
+
+def test_drift_by_length_of_a_scale_error_and_a_constant_turn():
+    # 250 m straight: 3 % short, then 0.001 rad off in each metre; stretches of 300 m there are none
+    steps = np.tile((1.0, 0.0, 0.0), (250, 1))
+    report = drift_by_length(accumulate_steps(steps * 0.97), accumulate_steps(steps), (100.0, 150.0, 300.0))
+    np.testing.assert_array_equal(report.lengths_m, (100.0, 150.0))
+    np.testing.assert_array_equal(report.n_stretches, (16, 11))  # from 0, 10 ... 150; and 0, 10 ... 100
+    np.testing.assert_allclose(report.translation_pct, 3.0)
+    assert report.mean_translation_pct == pytest.approx(3.0)
+    assert np.abs(report.rotation_deg_per_100m).max() < 1e-9
+    turning = drift_by_length(accumulate_steps(steps + (0, 0, -0.001)), accumulate_steps(steps), (100.0,))
+    np.testing.assert_allclose(turning.rotation_deg_per_100m, np.rad2deg(0.1))
+
+
+def test_drift_over_a_way_too_short_has_no_length_left():
+    poses = accumulate_steps(np.tile((1.0, 0.0, 0.0), (50, 1)))
+    report = drift_by_length(poses, poses)
+    assert len(report.lengths_m) == len(report.n_stretches) == len(report.translation_pct) == 0
+    assert np.isnan(report.mean_translation_pct) and np.isnan(report.mean_rotation_deg_per_100m)
+    with pytest.raises(EvaluationError, match="50 estimated poses for 51 true ones"):
+        drift_by_length(poses[1:], poses)
+
+
+def matrix(pose: np.ndarray) -> np.ndarray:
+    """A planar pose as a 4 x 4 matrix, for the loop below."""
+    c, s = np.cos(pose[2]), np.sin(pose[2])
+    return np.array([[c, -s, 0, pose[0]], [s, c, 0, pose[1]], [0, 0, 1, 0], [0, 0, 0, 1]])
+
+
+def kitti_loop(estimate: np.ndarray, truth: np.ndarray, lengths_m: list[float]) -> dict[float, np.ndarray]:
+    """The benchmark's kit, written as it is in C++: matrices, and one stretch after the other."""
+    way = [0.0]
+    for i in range(1, len(truth)):
+        way.append(way[-1] + float(np.linalg.norm(truth[i, :2] - truth[i - 1, :2])))
+    found: dict[float, list[tuple[float, float]]] = {}
+    for first in range(0, len(way), 10):
+        for length in lengths_m:
+            last = next((i for i in range(first, len(way)) if way[i] >= way[first] + length), -1)
+            if last == -1:
+                continue
+            delta_truth = np.linalg.inv(matrix(truth[first])) @ matrix(truth[last])
+            delta_estimate = np.linalg.inv(matrix(estimate[first])) @ matrix(estimate[last])
+            error = np.linalg.inv(delta_estimate) @ delta_truth
+            angle = np.arccos(np.clip((np.trace(error[:3, :3]) - 1.0) / 2.0, -1.0, 1.0))
+            found.setdefault(length, []).append((np.linalg.norm(error[:3, 3]) / length, angle / length))
+    return {length: np.array(errors) for length, errors in found.items()}
+
+
+def test_drift_by_length_agrees_with_a_slow_loop():
+    rng = np.random.default_rng(4)
+    steps = np.column_stack(
+        [rng.uniform(0.0, 2.5, 900), rng.normal(0.0, 0.02, 900), rng.normal(0.0, 0.03, 900)]
+    )
+    truth = accumulate_steps(steps)
+    estimate = accumulate_steps(steps * (0.98, 1.0, 1.0) + rng.normal(0.0, (0.05, 0.02, 0.002), (900, 3)))
+    report = drift_by_length(estimate, truth)
+    loop = kitti_loop(estimate, truth, [100.0 * k for k in range(1, 9)])
+    assert report.lengths_m.tolist() == list(loop) == [100.0 * k for k in range(1, 9)]
+    for i, errors in enumerate(loop.values()):
+        assert report.n_stretches[i] == len(errors)
+        assert report.translation_pct[i] == pytest.approx(100.0 * errors[:, 0].mean(), abs=1e-9)
+        assert report.rotation_deg_per_100m[i] == pytest.approx(
+            np.rad2deg(100.0 * errors[:, 1].mean()), abs=1e-6
+        )
+    every = np.concatenate(list(loop.values()))
+    assert report.mean_translation_pct == pytest.approx(100.0 * every[:, 0].mean(), abs=1e-9)
+    assert drift(estimate, truth, tuple(loop)) == pytest.approx(every[:, 0].mean(), abs=1e-12)
+
+
+def test_error_figures_by_hand():
+    # facing along x: errors (3, 4), (0, 1), (1, 0); headings 1, -3 and 2 deg off
+    estimate = np.array([[3.0, 4.0, np.deg2rad(1)], [0.0, 1.0, np.deg2rad(-3)], [1.0, 0.0, np.deg2rad(2)]])
+    assert error_figures(pose_errors(estimate, np.zeros((3, 3)))) == {
+        "median_m": pytest.approx(1.0),
+        "median_yaw_deg": pytest.approx(2.0),
+        "rmse_longitudinal_m": pytest.approx(np.sqrt(10 / 3)),
+        "rmse_lateral_m": pytest.approx(np.sqrt(17 / 3)),
+    }
+
+
+def test_nees_by_hand():
+    truth = np.array([[0.0, 0.0, 3.1], [5.0, 5.0, 0.0]])
+    estimate = np.array([[2.0, -1.0, -3.1], [5.0, 5.0, 0.0]])
+    # across the cut the heading is off by 2 pi - 6.2; sigmas 1 m, 0.5 m, 0.1 rad: 4 + 4 + its share
+    covariances = np.tile(np.diag([1.0, 0.25, 0.01]), (2, 1, 1))
+    nees = pose_nees(estimate, truth, covariances)
+    np.testing.assert_allclose(nees, [8.0 + (2 * np.pi - 6.2) ** 2 / 0.01, 0.0])
+    figures = consistency(estimate, truth, covariances)
+    assert figures == {"mean_nees": pytest.approx(nees.mean()), "within_95": 0.5}
+    # correlated errors: C = [[2, 1], [1, 2]] has the inverse [[2, -1], [-1, 2]] / 3, so (1, 1) gives 2 / 3
+    covariances[0] = [[2.0, 1.0, 0.0], [1.0, 2.0, 0.0], [0.0, 0.0, 1.0]]
+    assert pose_nees(truth[:1] + (1.0, 1.0, 0.0), truth[:1], covariances[:1])[0] == pytest.approx(2.0 / 3.0)
+
+
+def test_errors_drawn_from_their_covariances_are_consistent_and_smaller_covariances_are_not():
+    rng, n = np.random.default_rng(5), 20_000
+    root = np.array([[0.5, 0.0, 0.0], [0.2, 0.3, 0.0], [0.01, 0.0, 0.02]])
+    covariances = np.tile(root @ root.T, (n, 1, 1))
+    truth = np.column_stack([rng.uniform(-90, 90, (n, 2)), rng.uniform(-np.pi, np.pi, n)])
+    estimate = truth + rng.normal(size=(n, 3)) @ root.T
+    estimate[:, 2] = (estimate[:, 2] + np.pi) % (2 * np.pi) - np.pi
+    figures = consistency(estimate, truth, covariances)
+    assert figures["mean_nees"] == pytest.approx(3.0, abs=0.1)  # five standard errors
+    assert figures["within_95"] == pytest.approx(0.95, abs=0.008)
+    assert consistency(estimate, truth, covariances / 4)["mean_nees"] == pytest.approx(
+        4 * figures["mean_nees"]
+    )
+
+
+def test_the_bound_of_nees_is_that_of_chi_square():
+    from scipy.stats import chi2
+
+    assert pytest.approx(chi2.ppf(0.95, 3), rel=1e-12) == NEES_95
+
+
+@pytest.mark.parametrize(
+    ("bad", "fault"),
+    [
+        ([[1, 0, 0], [0, np.nan, 0], [0, 0, 1]], "matrix at index 1 is not finite"),
+        ([[1, 0.5, 0], [0, 1, 0], [0, 0, 1]], "matrix at index 1 is not symmetric"),
+        ([[1, 2, 0], [2, 1, 0], [0, 0, 1]], "matrix at index 1 is not positive definite"),
+        (np.zeros((3, 3)), "matrix at index 1 is not positive definite"),
+        (np.ones((3, 3)), "matrix at index 1 is not positive definite"),
+    ],
+)
+def test_bad_covariances_are_named(bad, fault):
+    poses, good = np.zeros((3, 3)), np.eye(3)
+    with pytest.raises(EvaluationError, match=f"covariances: {fault}"):
+        pose_nees(poses, poses, np.array([good, bad, good]))
+    with pytest.raises(EvaluationError, match=r"covariances: expected shape \(3, 3, 3\), got \(2, 3, 3\)"):
+        pose_nees(poses, poses, np.array([good, good]))
 
 
 def test_tum_round_trip(tmp_path):
@@ -196,3 +333,19 @@ def test_evo_reads_our_files_and_finds_our_errors(tmp_path):
         ape = evo_metrics.APE(relation)
         ape.process_data(pair)
         assert ape.get_statistic(evo_metrics.StatisticsType.rmse) == pytest.approx(ours, rel=1e-5)
+
+
+def test_evo_finds_the_same_ape_in_our_files_to_the_last_digit(tmp_path):
+    pytest.importorskip("evo")
+    from evo.core import metrics as evo_metrics
+    from evo.tools import file_interface
+
+    stamps_us, estimate, truth = noisy_run()
+    paths = tmp_path / "truth.tum", tmp_path / "estimate.tum"
+    for path, poses in zip(paths, (truth, estimate), strict=True):
+        write_tum(path, stamps_us, poses)
+    ape = evo_metrics.APE(evo_metrics.PoseRelation.translation_part)
+    ape.process_data(tuple(file_interface.read_tum_trajectory_file(path) for path in paths))
+    read_truth, read_estimate = (read_tum(path)[1] for path in paths)
+    ours = rmse(pose_errors(read_estimate, read_truth).position_m)
+    assert ape.get_statistic(evo_metrics.StatisticsType.rmse) == pytest.approx(ours, rel=0, abs=1e-9)

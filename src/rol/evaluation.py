@@ -15,11 +15,13 @@ from pathlib import Path
 import numpy as np
 
 try:
-    from .geometry import check_poses, relative_pose
+    from .geometry import check_poses, relative_pose, wrap_angle
 except ImportError:  # this file was copied on its own
-    from geometry import check_poses, relative_pose
+    from geometry import check_poses, relative_pose, wrap_angle
 
 CLASSES = ((1.0, 2.0), (2.0, 5.0), (5.0, 10.0))  # limits of Table III: position [m], heading [deg]
+KITTI_LENGTHS_M = tuple(100.0 * k for k in range(1, 9))  # stretches of the KITTI odometry benchmark [m]
+NEES_95 = 7.814727903251179  # 95 % of a chi-square distribution of three degrees of freedom lie below
 
 
 class EvaluationError(ValueError):
@@ -63,9 +65,7 @@ def pose_errors(estimate: np.ndarray, truth: np.ndarray) -> PoseErrors:
     EvaluationError
         If the lengths differ or there is no pose.
     """
-    estimate, truth = check_poses(estimate, "estimate"), check_poses(truth, "truth")
-    if estimate.shape != truth.shape or len(estimate) == 0:
-        raise EvaluationError(f"{len(estimate)} estimated poses for {len(truth)} true ones")
+    estimate, truth = _check_pair(estimate, truth)
     ahead, left, turned = relative_pose(truth, estimate).T
     return PoseErrors(np.hypot(ahead, left), ahead, left, turned)
 
@@ -213,8 +213,139 @@ def summarize(
     }
 
 
+def error_figures(errors: PoseErrors) -> dict[str, float]:
+    """Give figures of a run beyond those of the paper: medians, and the errors along and across the way.
+
+    Parameters
+    ----------
+    errors : PoseErrors
+        From `pose_errors`.
+
+    Returns
+    -------
+    figures : dict
+        ``median_m`` and ``median_yaw_deg`` of the absolute errors, ``rmse_longitudinal_m`` and
+        ``rmse_lateral_m`` in the true radar frame. Not part of ``metrics.json``.
+    """
+    return {
+        "median_m": float(np.median(errors.position_m)),
+        "median_yaw_deg": float(np.median(np.abs(np.rad2deg(errors.yaw_rad)))),
+        "rmse_longitudinal_m": rmse(errors.longitudinal_m),
+        "rmse_lateral_m": rmse(errors.lateral_m),
+    }
+
+
+def pose_nees(estimate: np.ndarray, truth: np.ndarray, covariances: np.ndarray) -> np.ndarray:
+    """Give the normalized estimation error squared of poses: how large an error is beside its own covariance.
+
+    Parameters
+    ----------
+    estimate, truth : array, shape (n, 3)
+        Poses T_map_radar [m, m, rad].
+    covariances : array, shape (n, 3, 3)
+        Covariances of (x, y, yaw) in the map frame, of each estimate [m, m, rad].
+
+    Returns
+    -------
+    nees : array, shape (n,)
+        e' C^-1 e with e = estimate - truth, its heading in [-pi, pi). Mean 3 where covariances are honest.
+
+    Raises
+    ------
+    EvaluationError
+        If lengths differ, or a covariance is not finite, symmetric and positive definite; names its index.
+    """
+    estimate, truth = _check_pair(estimate, truth)
+    covariances = _check_covariances(covariances, len(estimate))
+    errors = estimate - truth
+    errors[:, 2] = wrap_angle(errors[:, 2])
+    return np.einsum("ni,ni->n", errors, np.linalg.solve(covariances, errors[..., None])[..., 0])
+
+
+def consistency(estimate: np.ndarray, truth: np.ndarray, covariances: np.ndarray) -> dict[str, float]:
+    """Judge whether covariances tell the errors: an honest filter has a mean NEES of 3 and 95 % within the bound.
+
+    Parameters
+    ----------
+    estimate, truth, covariances
+        As in `pose_nees`.
+
+    Returns
+    -------
+    figures : dict
+        ``mean_nees``, above 3 for a filter too sure of itself, and ``within_95``, the share of poses whose NEES lies
+        below ``NEES_95`` (0..1).
+
+    Raises
+    ------
+    EvaluationError
+        As in `pose_nees`.
+    """
+    nees = pose_nees(estimate, truth, covariances)
+    return {"mean_nees": float(np.mean(nees)), "within_95": float(np.mean(nees <= NEES_95))}
+
+
+@dataclass(frozen=True)
+class DriftReport:
+    """Drift of odometry over stretches of several lengths.
+
+    Attributes
+    ----------
+    lengths_m : array, shape (k,)
+        Lengths for which the way is long enough, of those asked for [m].
+    n_stretches : array of int, shape (k,)
+        Stretches of each.
+    translation_pct : array, shape (k,)
+        Mean position error at their end, in per cent of their length.
+    rotation_deg_per_100m : array, shape (k,)
+        Mean heading error at their end, without its sign [deg per 100 m].
+    mean_translation_pct, mean_rotation_deg_per_100m : float
+        Means over all stretches of all lengths, the benchmark's two numbers; NaN without a stretch.
+    """
+
+    lengths_m: np.ndarray
+    n_stretches: np.ndarray
+    translation_pct: np.ndarray
+    rotation_deg_per_100m: np.ndarray
+    mean_translation_pct: float
+    mean_rotation_deg_per_100m: float
+
+
+def drift_by_length(
+    estimate: np.ndarray, truth: np.ndarray, lengths_m: tuple[float, ...] = KITTI_LENGTHS_M
+) -> DriftReport:
+    """Measure the drift of odometry in the full form of the KITTI benchmark.
+
+    Parameters
+    ----------
+    estimate, truth : array, shape (n, 3)
+        Poses in any two frames [m, m, rad].
+    lengths_m : tuple of float
+        Lengths of the stretches along the true way [m]; one starts at every tenth pose and ends at the first pose so
+        far on. Those that the way is too short for are left out.
+
+    Returns
+    -------
+    report : DriftReport
+        Which lengths remain, and the errors of each.
+
+    Raises
+    ------
+    EvaluationError
+        If the lengths differ or there is no pose.
+    """
+    estimate, truth = _check_pair(estimate, truth)
+    errors = [_stretch_errors(estimate, truth, length) for length in lengths_m]
+    is_kept = np.array([len(error) > 0 for error in errors], dtype=bool)
+    kept = [error for error in errors if len(error)]
+    means = np.array([error.mean(axis=0) for error in kept]).reshape(-1, 2)
+    overall = np.concatenate(kept).mean(axis=0) if kept else np.full(2, np.nan)
+    n_stretches = np.array([len(error) for error in kept], dtype=int)
+    return DriftReport(np.array(lengths_m)[is_kept], n_stretches, *means.T, *map(float, overall))
+
+
 def drift(estimate: np.ndarray, truth: np.ndarray, lengths_m: tuple[float, ...] = (100.0, 200.0)) -> float:
-    """Measure the drift of odometry over stretches of the way, as the KITTI benchmark does.
+    """Give the drift of odometry as one number, see `drift_by_length`.
 
     Parameters
     ----------
@@ -228,18 +359,13 @@ def drift(estimate: np.ndarray, truth: np.ndarray, lengths_m: tuple[float, ...] 
     drift : float
         Mean over stretches of the end's position error over the stretch's length; NaN if the way is too
         short.
+
+    Raises
+    ------
+    EvaluationError
+        If the lengths differ or there is no pose.
     """
-    estimate, truth = check_poses(estimate, "estimate"), check_poses(truth, "truth")
-    way = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(truth[:, :2], axis=0).T))])
-    shares = []
-    for length in lengths_m:
-        first = np.arange(0, len(way), 10)
-        last = np.searchsorted(way, way[first] + length)
-        first, last = first[last < len(way)], last[last < len(way)]
-        ends = relative_pose(truth[first], truth[last]), relative_pose(estimate[first], estimate[last])
-        shares.append(np.hypot(*(ends[0] - ends[1])[:, :2].T) / length)
-    shares = np.concatenate(shares)
-    return float(np.mean(shares)) if len(shares) else float("nan")
+    return drift_by_length(estimate, truth, lengths_m).mean_translation_pct / 100.0
 
 
 def write_text(path: Path | str, text: str) -> None:
@@ -371,6 +497,42 @@ def read_metrics(path: Path | str) -> dict[str, str | int | float]:
         raise EvaluationError(f"{path}: not a whole json file ({error})") from error
     _check_metrics(path, metrics)
     return metrics
+
+
+def _check_pair(estimate: np.ndarray, truth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Check that there are poses, and as many estimated as true ones."""
+    estimate, truth = check_poses(estimate, "estimate"), check_poses(truth, "truth")
+    if estimate.shape != truth.shape or len(estimate) == 0:
+        raise EvaluationError(f"{len(estimate)} estimated poses for {len(truth)} true ones")
+    return estimate, truth
+
+
+def _check_covariances(covariances: np.ndarray, n: int) -> np.ndarray:
+    """Check that there are n covariances, finite, symmetric and positive definite."""
+    covariances = np.asarray(covariances, dtype=np.float64)
+    if covariances.shape != (n, 3, 3):
+        raise EvaluationError(f"covariances: expected shape ({n}, 3, 3), got {covariances.shape}")
+    checks = {
+        "finite": lambda c: np.isfinite(c).all(axis=(1, 2)),
+        "symmetric": lambda c: np.isclose(c, c.transpose(0, 2, 1), rtol=1e-6, atol=1e-12).all(axis=(1, 2)),
+        "positive definite": lambda c: np.linalg.eigvalsh(c) @ (1.0, 0.0, -1e-15) > 0.0,  # beyond rounding
+    }
+    for quality, check in checks.items():
+        is_good = check(covariances)
+        if not is_good.all():
+            raise EvaluationError(f"covariances: matrix at index {int(np.argmin(is_good))} is not {quality}")
+    return covariances
+
+
+def _stretch_errors(estimate: np.ndarray, truth: np.ndarray, length_m: float) -> np.ndarray:
+    """Errors at the end of stretches of one length, shape (n, 2): position [%], heading [deg per 100 m]."""
+    way = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(truth[:, :2], axis=0).T))])
+    first = np.arange(0, len(way), 10)
+    last = np.searchsorted(way, way[first] + length_m)
+    first, last = first[last < len(way)], last[last < len(way)]
+    ends = (relative_pose(poses[first], poses[last]) for poses in (truth, estimate))
+    x, y, yaw = relative_pose(*ends).T
+    return np.stack([np.hypot(x, y), np.rad2deg(np.abs(yaw))], axis=1) * (100.0 / length_m)
 
 
 def _check_metrics(path: Path | str, metrics: dict[str, str | int | float]) -> None:
