@@ -43,7 +43,7 @@ def test_target_is_the_lidar_near_by_and_the_old_drawing_beyond(generator: torch
     radar, lidar = draw_real_pair(generator, pair, 0.0, reach_m=15.0, threshold=100, settings=SETTINGS)
     axis = 31.5 - np.arange(64)
     ranges = np.hypot(axis[:, None], axis[None, :])
-    drawn = np.where(generate(generator, radar) >= 100, 255, 0)
+    drawn = np.where(generate(generator, radar, headings=1) >= 100, 255, 0)
     np.testing.assert_array_equal(lidar[ranges >= 15.0], drawn[ranges >= 15.0])
     rows, columns = np.nonzero((lidar > 0) & (ranges < 15.0))
     assert len(rows) > 10 and (np.abs(axis[columns] - 10.0) <= 0.5).all()  # y is to the left

@@ -59,6 +59,27 @@ def test_real_scans_that_are_missing_are_told(tmp_path: Path) -> None:
         rall.load_scans(tmp_path)
 
 
+@pytest.mark.parametrize(
+    ("stamps_us", "groups"),
+    [
+        ([], []),
+        ([5], [[0]]),
+        ([0, 250_000, 500_000], [[0, 1, 2]]),
+        ([0, 1_000_000, 2_000_001], [[0, 1], [2]]),  # a second is no gap yet
+        ([0, 5_000_000, 5_250_000, 99_000_000], [[0], [1, 2], [3]]),
+    ],
+)
+def test_scans_far_apart_are_no_drive(stamps_us: list[int], groups: list[list[int]]) -> None:
+    assert rall.group_scans(stamps_us) == groups
+
+
+def test_wider_gaps_may_be_allowed_and_disorder_is_told() -> None:
+    assert rall.group_scans([0, 3_000_000], 3.0) == [[0, 1]]
+    for stamps_us in ([0, 0], [0, 250_000, 1]):
+        with pytest.raises(rall.RallError, match=f"scan {len(stamps_us) - 1}: its time"):
+            rall.group_scans(stamps_us)
+
+
 def test_find_real_root(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.delenv("ROL_REAL_ROOT", raising=False)
@@ -105,6 +126,12 @@ def test_faulty_maps_and_scan_poses_are_named(tmp_path: Path) -> None:
         rall.load_map_points(path)
     cv2.imwrite(str(path), np.zeros((4, 4), dtype=np.uint8))
     with pytest.raises(rall.RallError, match="holds no occupied cell"):
+        rall.load_map_points(path)
+    cv2.imwrite(str(path), np.full((4, 5), 255, dtype=np.uint8))
+    with pytest.raises(rall.RallError, match=r"map.png: \(4, 5\) pixels instead of \(8000, 8000\)"):
+        rall.load_map_points(path, rall.MAP_SHAPE)
+    cv2.imwrite(str(path), np.full((4, 4), 128, dtype=np.uint8))
+    with pytest.raises(rall.RallError, match=r"map.png: holds the value 128; 0 is free and 255 occupied"):
         rall.load_map_points(path)
     cv2.imwrite(str(path), np.zeros((4, 4, 3), dtype=np.uint8))
     with pytest.raises(rall.RallError, match="one grey channel"):

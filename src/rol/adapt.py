@@ -79,7 +79,7 @@ def draw_real_pair(
     seen = points_to_image(pair.points @ np.array([[c, s], [-s, c]]), width=width, pixel_size=size)
     axis = ((width - 1) / 2.0 - np.arange(width)) * size
     is_near = np.hypot(axis[:, None], axis[None, :]) < reach_m
-    drawn = np.where(generate(generator, radar) >= threshold, 255, 0)
+    drawn = np.where(generate(generator, radar, headings=1) >= threshold, 255, 0)  # turned at random anyhow
     return radar, np.where(is_near, seen, drawn).astype(np.uint8)
 
 

@@ -8,6 +8,7 @@ lie under a folder that is called `real_root` everywhere, in the layout of the p
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -19,6 +20,7 @@ ODOMETRY_PATH = Path("RaLL/data/odom/RobotCar")
 SCANS_PATH = Path("RadarSLAMPy/data/tiny")
 SCAN_POSES_PATH = Path("oxford_scan_map_poses.csv")
 MAP_CELL = 0.25  # side of a pixel of the map [m]
+MAP_SHAPE = (8000, 8000)  # of the published picture; of another one nobody knows where its pixels lie
 MAP_CORNER = (
     1500.0,
     800.0,
@@ -76,13 +78,15 @@ def find_real_root(given: str | Path = "") -> Path | None:
     return None
 
 
-def load_map_points(path: Path | str) -> np.ndarray:
+def load_map_points(path: Path | str, shape: tuple[int, int] | None = None) -> np.ndarray:
     """Read the lidar map, a picture of occupied cells.
 
     Parameters
     ----------
     path : path
-        PNG of 0.25 m per pixel, zero for free; x points up and y to the left.
+        PNG of 0.25 m per pixel, zero for free, 255 for occupied; x points up and y to the left.
+    shape : tuple of int, optional
+        Rows and columns that the picture must have, such as ``MAP_SHAPE``; any if not given.
 
     Returns
     -------
@@ -92,7 +96,7 @@ def load_map_points(path: Path | str) -> np.ndarray:
     Raises
     ------
     RallError
-        If the file is missing, no grey picture, or empty.
+        If the file is missing, no grey picture, of another size, with other values, or empty.
     """
     import cv2
 
@@ -102,6 +106,11 @@ def load_map_points(path: Path | str) -> np.ndarray:
         raise RallError(f"{path}: missing or not a picture")
     if image.ndim != 2:
         raise RallError(f"{path}: expected one grey channel, got shape {image.shape}")
+    if shape is not None and image.shape != shape:
+        raise RallError(f"{path}: {image.shape} pixels instead of {shape}, so their places are not known")
+    is_odd = (image != 0) & (image != 255)
+    if is_odd.any():
+        raise RallError(f"{path}: holds the value {image[is_odd][0]}; 0 is free and 255 occupied")
     rows, columns = np.nonzero(image)
     if len(rows) == 0:
         raise RallError(f"{path}: the map holds no occupied cell")
@@ -222,6 +231,38 @@ def load_scans(real_root: Path | str) -> list[RealScan]:
         scan = load_radar(path)
         scans.append(RealScan(path, stamp, scan.codes, scan.azimuths, poses[stamp], twists.get(stamp)))
     return scans
+
+
+def group_scans(stamps_us: Sequence[int], max_gap_s: float = 1.0) -> list[list[int]]:
+    """Divide scans into drives: a new one begins after a long gap.
+
+    Parameters
+    ----------
+    stamps_us : sequence of int
+        Times of the scans [us], in order.
+    max_gap_s : float
+        Scans more than this apart are not of one drive [s].
+
+    Returns
+    -------
+    groups : list of list of int
+        Indices of the scans of each drive, in the order of time; none is empty.
+
+    Raises
+    ------
+    RallError
+        If the times do not increase.
+    """
+    groups: list[list[int]] = []
+    for i, stamp in enumerate(stamps_us):
+        gap_us = stamp - stamps_us[i - 1] if i else 0
+        if i and gap_us <= 0:
+            raise RallError(f"scan {i}: its time does not come after that of the scan before")
+        if i and gap_us <= max_gap_s * 1e6:
+            groups[-1].append(i)
+        else:
+            groups.append([i])
+    return groups
 
 
 def _official_twists(path: Path, stamps: list[int]) -> dict[int, tuple[float, float, float]]:

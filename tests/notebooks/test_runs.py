@@ -47,6 +47,15 @@ def check_localization(folder: Path, session: str, method: str) -> dict:
     return metrics
 
 
+def test_every_route_run_wrote_its_files(profile: dict, real_root: Path) -> None:
+    folders = sorted(Path(profile["out_dir"], "oxford_route").glob("*/*/metrics.json"))
+    assert {folder.parent.name for folder in folders} == {"paper", "rol"}
+    for folder in folders:
+        metrics = check_localization(folder.parent, folder.parents[1].name, folder.parent.name)
+        if metrics["method"] == "rol":
+            assert metrics["failures"] == 0 and metrics["rmse_m"] < 0.3 and metrics["within_1m_2deg"] > 0.97
+
+
 def test_every_real_scan_is_judged(profile: dict, real_root: Path) -> None:
     rows = pd.read_csv(Path(profile["out_dir"], "real_radar", "scans.csv"))
     shares = ["share_1m_raw", "share_2m_raw", "share_1m_fake", "share_2m_fake"]
@@ -54,6 +63,16 @@ def test_every_real_scan_is_judged(profile: dict, real_root: Path) -> None:
     stamps = {int(path.stem) for path in (real_root / "RadarSLAMPy/data/tiny/radar").glob("*.png")}
     assert set(rows["timestamp_us"]) == stamps
     assert rows[shares].stack().between(0.0, 1.0).all()
+    # Found from 5 m and 5 deg off; where a drive has four scans, near the fitted poses from the fourth on.
+    fitted = pd.read_csv(real_root / "oxford_scan_map_poses.csv").set_index("timestamp_us")
+    fitted = fitted.loc[rows["timestamp_us"]].reset_index()
+    names = ["x_m", "y_m", "yaw_rad"]
+    drive = (rows["timestamp_us"].diff() > 1_000_000).cumsum()
+    is_late = rows.groupby(drive).cumcount() >= 3
+    off = (rows[names] - fitted[names])[is_late]
+    assert rows[names].notna().all(axis=None) and is_late.any()
+    assert ((off["x_m"] ** 2 + off["y_m"] ** 2) ** 0.5 < 0.6).all()
+    assert (off["yaw_rad"].abs() < 0.6 * 3.1416 / 180.0).all()
 
 
 @pytest.mark.parametrize("profile", ["smoke"], indirect=True)
