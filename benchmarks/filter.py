@@ -189,7 +189,7 @@ def time_builds(map_points: np.ndarray, rounds: int) -> dict[str, dict[str, floa
     for cell in CELLS:
         rows[f"building, {cell} m"] = {
             "matched cells": partial(mcl.build_matched_grid, map_points, cell=cell),
-            "log-likelihoods": partial(mcl.build_likelihood_grid, map_points, cell=cell),
+            "distances": partial(mcl.build_distance_grid, map_points, cell=cell),
         }
     return time_rows(rows, rounds)
 

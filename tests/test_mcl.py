@@ -118,18 +118,18 @@ def test_matched_grid_uses_a_strict_threshold():
     assert mcl.build_matched_grid(np.array([[0.5, 0.5]]), d_th=1.01, cell=1.0).values.sum() == 5
 
 
-def test_likelihood_grid_by_hand():
-    # on the point log(1 / floor), one sigma away log(floor + 0.8 exp(-1/2)) - log(floor), far away nothing
-    grid = mcl.build_likelihood_grid(np.array([[0.05, 0.05]]), sigma=0.5, floor=0.2, cell=0.1)
+def test_distance_grid_by_hand():
+    # on the point one, one sigma away exp(-1/2), three sigma away nothing
+    grid = mcl.build_distance_grid(np.array([[0.05, 0.05]]), sigma=0.5, cell=0.1)
     i, j = np.floor((np.array([0.05, 0.05]) - grid.origin) / 0.1).astype(int)
     assert grid.values[i, j] == grid.best == 255
-    assert grid.values[i + 5, j] * grid.scale == pytest.approx(np.log((0.2 + 0.8 * 0.60653) / 0.2), abs=0.01)
+    assert grid.values[i + 5, j] / grid.best == pytest.approx(np.exp(-0.5), abs=0.01)
+    assert grid.values[i + 10, j] / grid.best == pytest.approx(np.exp(-2.0), abs=0.01)
     assert grid.values[0, 0] == 0
-    assert 255 * grid.scale == pytest.approx(np.log(5.0))
 
 
 def test_an_empty_map_is_an_error():
-    for build in (mcl.build_matched_grid, mcl.build_likelihood_grid):
+    for build in (mcl.build_matched_grid, mcl.build_distance_grid):
         with pytest.raises(mcl.MclError, match="the map holds no point"):
             build(np.zeros((0, 2)))
     with pytest.raises(mcl.MclError, match="map: a point is not finite"):
@@ -273,7 +273,7 @@ def wall_filter(clouds, steps, **changes):
     """Run the filter along a straight wall with a corner, from the origin."""
     points = np.stack([np.arange(0.0, 40.0, 0.25), np.full(160, 5.0)], axis=1)
     points = np.concatenate([points, np.stack([np.full(20, 40.0), np.arange(0.0, 5.0, 0.25)], axis=1)])
-    settings = mcl.MclSettings(n_particles=200, **changes)
+    settings = mcl.MclSettings(**{"n_particles": 200, **changes})
     grid = mcl.build_grid(points, settings)
     rng = np.random.default_rng(8)
     return points, list(mcl.localize(steps, clouds, grid, (30.0, 0.0, 0.0), settings, rng))
@@ -462,3 +462,23 @@ def test_count_matches_of_nothing(parallel):
         assert mcl.count_matches(two, CLOUD, empty, ORIGIN, 1.0, parallel=parallel).tolist() == [0, 0]
     assert mcl.count_matches(two, none, MATCHED, ORIGIN, 1.0, parallel=parallel).tolist() == [0, 0]
     assert mcl.count_matches(two[:0], CLOUD, MATCHED, ORIGIN, 1.0, parallel=parallel).shape == (0,)
+
+
+def test_needed_particles_follow_the_spread():
+    rng = np.random.default_rng(1)
+    narrow, wide = (rng.normal(0.0, sigma, (4000, 3)) * (1.0, 1.0, 0.1) for sigma in (0.05, 1.0))
+    assert mcl.count_needed(np.zeros((50, 3))) == 1
+    assert mcl.count_needed(narrow) < 300 < mcl.count_needed(wide)
+    two = np.array(
+        [[0.1, 0.1, 0.01], [9.1, 0.1, 0.01]]
+    )  # one degree of freedom: 0.99 quantile of chi-square, 6.63
+    assert mcl.count_needed(two) == pytest.approx(6.63 / (2 * 0.05), rel=0.05)
+
+
+def test_adaptive_filter_sheds_particles_and_keeps_the_least():
+    points, _ = wall_filter([], [])
+    cloud = points - (30.0, 0.0)
+    _, updates = wall_filter([cloud] * 6, [(0.0, 0.0, 0.0)] * 5, min_particles=40, n_particles=1500)
+    sizes = [len(u.next_particles) for u in updates]
+    assert sizes[0] <= 1500 and 40 <= sizes[-1] < 1500
+    assert updates[-1].next_weights.sum() == pytest.approx(1.0)

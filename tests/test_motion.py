@@ -5,7 +5,7 @@ import pytest
 
 from rol import rall
 from rol.geometry import relative_pose
-from rol.motion import MotionModel, correct_step, learn_motion, sample_motion
+from rol.motion import MotionModel, correct_step, learn_motion, sample_motion, screen_steps
 
 
 def drive(rng: np.random.Generator, n: int = 4000) -> np.ndarray:
@@ -39,13 +39,19 @@ def test_errors_that_go_on_count_as_what_they_become() -> None:
 
 def test_a_step_is_corrected_and_its_noise_drawn() -> None:
     model = MotionModel(
-        ((1.1, 0.0, 0.0), (0.0, 0.0, 2.0), (0.0, 0.0, 1.0)), (0.1, 0.0, 0.0), (0.1, 0.0, 0.0), 0.0, 1.0
+        ((1.1, 0.0, 0.0), (0.0, 0.0, 2.0), (0.0, 0.0, 1.0)),
+        still=(0.5, 0.0, 0.0),
+        driving=(0.1, 0.0, 0.0),
+        moving=(0.1, 0.0, 0.0),
+        outlier_share=0.0,
     )
     np.testing.assert_allclose(correct_step(np.array([2.0, 9.0, 0.1]), model), [2.2, 0.2, 0.1])
     start = np.tile([5.0, 5.0, np.pi / 2.0], (20_000, 1))
     moved = sample_motion(start, np.array([2.0, 0.0, 0.0]), model, np.random.default_rng(3))
     assert moved[:, 1].mean() == pytest.approx(7.2, abs=0.01) and moved[:, 0] == pytest.approx(5.0)
-    assert moved[:, 1].std() == pytest.approx(0.1 + 2.2 * 0.1, rel=0.03)  # still, and for each metre driven
+    assert moved[:, 1].std() == pytest.approx(0.1 + 2.2 * 0.1, rel=0.03)  # driving, and for each metre
+    moved = sample_motion(start, np.array([0.05, 0.0, 0.0]), model, np.random.default_rng(3))
+    assert moved[:, 1].std() == pytest.approx(0.5, rel=0.03)
 
 
 def test_a_share_of_the_particles_takes_the_noise_of_an_outlier() -> None:
@@ -73,3 +79,16 @@ def test_the_real_odometry_is_short_by_one_and_a_half_per_cent(real_root) -> Non
         told = rall.load_odometry(real_root / rall.ODOMETRY_PATH / f"seq{number}_odom.txt")[: len(true)]
         found.append(learn_motion(told, true).matrix[0][0])
     np.testing.assert_allclose(found, 1.0 / 0.985, atol=0.003)
+
+
+def test_steps_that_no_car_makes_are_replaced() -> None:
+    steps = np.tile([1.0, 0.0, 0.01], (9, 1))
+    steps[2, 0], steps[5, 2], steps[7, 0] = 2.0, 0.2, 1.4  # a jump, a twist, and a car that gains speed
+    screened = np.array(list(screen_steps(steps)))
+    np.testing.assert_allclose(screened[[2, 5]], [[1.0, 0.0, 0.01]] * 2)
+    np.testing.assert_array_equal(np.delete(screened, [2, 5], axis=0), np.delete(steps, [2, 5], axis=0))
+
+
+def test_a_change_that_lasts_is_believed() -> None:
+    steps = np.array([[0.0, 0.0, 0.0]] + [[2.0, 0.0, 0.0]] * 6)  # it was the first step that erred
+    assert np.array(list(screen_steps(steps)))[:, 0].tolist() == [0.0, 0.0, 0.0, 0.0, 2.0, 2.0, 2.0]

@@ -7,6 +7,7 @@ and now and then a step is plainly wrong. Steps are poses (x, y, yaw) of a scan 
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -26,33 +27,31 @@ class MotionModel:
     matrix : tuple of tuple of float, shape (3, 3)
         True step = matrix @ odometry step, on average.
     still : tuple of float, shape (3,)
-        Standard deviations of a step that goes nowhere (forward, left, yaw) [m, m, rad].
-    moving : tuple of float, shape (3,)
-        What is added to them for each metre of the step [m/m, m/m, rad/m].
+        Standard deviations of a step of less than ``still_m`` (forward, left, yaw) [m, m, rad].
+    driving, moving : tuple of float, shape (3,)
+        Those of a longer one, and what is added to them for each metre of it [m, m, rad] and [m/m, m/m, rad/m].
     outlier_share, outlier_scale : float
         Share of the steps that err so many times as much.
+    still_m : float
+        Length below which a car counts as standing [m].
     """
 
     matrix: tuple[tuple[float, ...], ...] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
-    still: tuple[float, float, float] = (0.05, 0.05, 0.004)
-    moving: tuple[float, float, float] = (0.05, 0.02, 0.002)
+    still: tuple[float, float, float] = (0.05, 0.05, 0.006)
+    driving: tuple[float, float, float] = (0.05, 0.05, 0.004)
+    moving: tuple[float, float, float] = (0.05, 0.02, 0.0)
     outlier_share: float = 0.02
     outlier_scale: float = 10.0
+    still_m: float = 0.1
 
 
-def learn_motion(
-    steps: np.ndarray,
-    true_steps: np.ndarray,
-    *,
-    window: int = 16,
-    outlier_share: float = 0.02,
-    outlier_scale: float = 10.0,
-) -> MotionModel:
+def learn_motion(steps: np.ndarray, true_steps: np.ndarray, *, window: int = 16) -> MotionModel:
     """Learn the model from steps whose truth is known.
 
     The matrix is fitted to sums over windows of steps, so that it holds over a way and not for a step alone; the noise
     is the spread of such sums per step, so that errors which go on from step to step count as what they become. Windows
-    with a gross error are left out.
+    with a gross error are left out; how often and how far a step errs grossly is too rare to be learnt from one drive,
+    and stays what `MotionModel` states.
 
     Parameters
     ----------
@@ -60,8 +59,6 @@ def learn_motion(
         What the odometry says and what is true [m, m, rad]; n at least two windows.
     window : int
         Steps that are summed up; over 16 steps, four seconds, errors are independent.
-    outlier_share, outlier_scale : float
-        Of the model: too rare to be learnt from one drive, so they are stated.
 
     Returns
     -------
@@ -78,22 +75,38 @@ def learn_motion(
             f"motion: {len(steps)} steps for {len(true_steps)} true ones, at least {2 * window} needed"
         )
     told, true = _window_sums(steps, window), _window_sums(true_steps, window)
-    length = _window_sums(np.hypot(steps[:, :1], steps[:, 1:2]), window)[:, 0] / window
-    rough = true_steps - steps @ np.linalg.lstsq(steps, true_steps, rcond=None)[0]
-    is_gross = (np.abs(rough) > 8.0 * 1.4826 * np.median(np.abs(rough), axis=0) + 1e-9).any(axis=1)
-    is_kept = _window_sums(is_gross[:, None].astype(np.float64), window)[:, 0] == 0.0
-    if not is_kept.any():
+    n_gross = _window_sums(_find_gross(steps, true_steps)[:, None].astype(np.float64), window)[:, 0]
+    if (n_gross > 0.0).all():
         raise ValueError(f"motion: a gross error in every window of {window} steps")
-    matrix = np.linalg.lstsq(told[is_kept], true[is_kept], rcond=None)[0].T
-    errors = true - told @ matrix.T
-    squares, is_still = errors**2 / window, length < 0.1
-    still = np.sqrt(squares[is_kept & is_still].mean(axis=0)) if (is_kept & is_still).any() else np.zeros(3)
-    spread = np.sqrt(squares[is_kept & ~is_still].mean(axis=0)) if (is_kept & ~is_still).any() else still
-    moving = np.maximum(spread - still, 0.0) / max(float(length[is_kept].max()), 0.1)
-    rows = tuple(tuple(float(v) for v in row) for row in matrix)
-    return MotionModel(
-        rows, tuple(map(float, still)), tuple(map(float, moving)), outlier_share, outlier_scale
-    )
+    told, true = told[n_gross == 0.0], true[n_gross == 0.0]
+    length = _window_sums(np.hypot(steps[:, :1], steps[:, 1:2]), window)[n_gross == 0.0, 0] / window
+    matrix = np.linalg.lstsq(told, true, rcond=None)[0].T
+    noise = _fit_noise((true - told @ matrix.T) / np.sqrt(window), length)
+    return MotionModel(tuple(tuple(float(v) for v in row) for row in matrix), *noise)
+
+
+def _find_gross(steps: np.ndarray, true_steps: np.ndarray) -> np.ndarray:
+    """Mark steps that err eight times as much as is usual, in any of their parts."""
+    errors = true_steps - steps @ np.linalg.lstsq(steps, true_steps, rcond=None)[0]
+    return (np.abs(errors) > 8.0 * 1.4826 * np.median(np.abs(errors), axis=0) + 1e-9).any(axis=1)
+
+
+def _fit_noise(errors: np.ndarray, length: np.ndarray) -> list[tuple[float, ...]]:
+    """Spread of errors when standing, when driving, and what a metre adds to that."""
+
+    def spread(chosen: np.ndarray, otherwise: np.ndarray) -> np.ndarray:
+        return np.sqrt(np.mean(errors[chosen] ** 2, axis=0)) if chosen.sum() > 4 else otherwise
+
+    is_still = length < MotionModel.still_m
+    is_fast = length > np.median(length[~is_still]) if (~is_still).any() else is_still
+    everywhere = np.sqrt(np.mean(errors**2, axis=0))
+    still, fast = spread(is_still, everywhere), spread(is_fast, everywhere)
+    slow = spread(~is_still & ~is_fast, fast)
+    gap = length[is_fast].mean() - length[~is_still & ~is_fast].mean() if is_fast.any() else 1.0
+    moving = np.maximum(fast - slow, 0.0) / max(float(gap), 0.1)
+    middle = float(length[~is_still & ~is_fast].mean()) if (~is_still & ~is_fast).any() else 0.0
+    driving = np.maximum(slow - moving * middle, 0.3 * slow)
+    return [tuple(map(float, values)) for values in (still, driving, moving)]
 
 
 def _window_sums(values: np.ndarray, window: int) -> np.ndarray:
@@ -122,6 +135,43 @@ def correct_step(step: np.ndarray, model: MotionModel) -> np.ndarray:
     return corrected
 
 
+def screen_steps(
+    steps: Iterable[np.ndarray],
+    *,
+    max_change: tuple[float, float] = (0.6, np.deg2rad(2.5)),
+    patience: int = 3,
+) -> Iterator[np.ndarray]:
+    """Replace steps that no car can make after the one before by that one: going on as it went errs less.
+
+    Parameters
+    ----------
+    steps : iterable of array, shape (3,)
+        Odometry [m, m, rad].
+    max_change : tuple of float
+        Change from one step to the next, forward [m] and in heading [rad], beyond which a step is not believed. At 4 Hz
+        0.6 m are an acceleration of 10 m/s2, full braking, and 2.5 deg more than twice what a car at a bend's entry
+        does.
+    patience : int
+        After so many steps in a row that are not believed the next one is: then it was the one before them that erred.
+
+    Yields
+    ------
+    step : array, shape (3,)
+        As many as given.
+    """
+    last, n_refused = None, 0
+    for step in steps:
+        step = check_poses(step, "odometry step")
+        if last is not None and n_refused < patience:
+            change = abs(step[0] - last[0]), abs(float(wrap_angle(step[2] - last[2])))
+            if change[0] > max_change[0] or change[1] > max_change[1]:
+                n_refused += 1
+                yield last.copy()
+                continue
+        last, n_refused = step, 0
+        yield step
+
+
 def sample_motion(
     particles: np.ndarray, step: np.ndarray, model: MotionModel, rng: np.random.Generator
 ) -> np.ndarray:
@@ -144,6 +194,10 @@ def sample_motion(
         Poses at this scan. Yin et al. 2020, Sec. III-B, Eq. 7, with a noise that is learnt.
     """
     mean = correct_step(step, model)
-    sigmas = np.array(model.still) + np.hypot(mean[0], mean[1]) * np.array(model.moving)
+    length = np.hypot(mean[0], mean[1])
+    is_still = length < model.still_m
+    sigmas = np.array(model.still if is_still else model.driving) + (not is_still) * length * np.array(
+        model.moving
+    )
     scale = np.where(rng.random(len(particles)) < model.outlier_share, model.outlier_scale, 1.0)
     return compose(particles, mean + rng.standard_normal((len(particles), 3)) * sigmas * scale[:, None])
