@@ -288,6 +288,24 @@ rule results:
         PAPERMILL
 
 
+rule oxford_route:
+    input:
+        notebook=source("09_oxford_route"),
+        tables=[str(path) for path in sorted(Path("data/paper").glob("*.csv"))],
+        measured=[str(path) for path in sorted(Path("data/ablations").glob("route_*.csv"))],
+    output:
+        notebook=executed("09_oxford_route"),
+    log:
+        **logs("09_oxford_route"),
+    params:
+        arguments=arguments("09_oxford_route"),
+        code=DIGESTS["09_oxford_route"],
+    message:
+        "09 the real route"
+    shell:
+        PAPERMILL
+
+
 rule real_radar:
     input:
         notebook=source("10_real_radar"),

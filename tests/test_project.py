@@ -332,9 +332,9 @@ def test_smoke_profile_plans_every_run(workplace: Path) -> None:
         "alignment": "5",
         "ground_removal": "5",
         "localization": "4",
-        "total": "28",
+        "total": "29",
         **dict.fromkeys(("book", "sessions", "pix2pix", "real_vs_fake", "ground_truth", "results"), "1"),
-        **dict.fromkeys(("real_radar", "ablations", "performance"), "1"),
+        **dict.fromkeys(("oxford_route", "real_radar", "ablations", "performance"), "1"),
     }
 
 

@@ -33,6 +33,7 @@ CHAPTERS = {
     "06_ground_truth": "once",
     "07_localization": "method",
     "08_results": "once",
+    "09_oxford_route": "once",
     "10_real_radar": "once",
     "11_ablations": "once",
     "12_performance": "once",

@@ -273,6 +273,7 @@ def draw_clouds(
     sight: Sight,
     front_end: FrontEnd,
     rng: np.random.Generator,
+    parts: np.ndarray | None = None,
 ) -> Iterator[np.ndarray]:
     """Draw the cloud of each scan of a drive, one after the other.
 
@@ -288,6 +289,10 @@ def draw_clouds(
         Shares, number of points, errors, reach, and how false points last.
     rng : numpy.random.Generator
         Source of randomness.
+    parts : array, shape (3,), optional
+        Parts of the three kinds, from `mix_kinds`. Without them they are found at these poses; for a piece of a drive
+        give those of the whole, or a dense place, where false points lie near the map by chance, would get hardly a
+        true one.
 
     Yields
     ------
@@ -300,8 +305,9 @@ def draw_clouds(
     MapPointsError
         If the shares cannot be had on this map, see `mix_kinds`.
     """
-    kinds = measure_kinds(map_points, poses, sight, front_end, rng)
-    parts = mix_kinds(kinds, front_end.share_1m, front_end.share_2m)
+    if parts is None:
+        kinds = measure_kinds(map_points, poses, sight, front_end, rng)
+        parts = mix_kinds(kinds, front_end.share_1m, front_end.share_2m)
     near, beside, false = (parts * front_end.n_points).round().astype(int)
     n_kept = round(false * front_end.persistent_share)
     standing, riding, tree = np.zeros((0, 2)), np.zeros((0, 2)), cKDTree(map_points)

@@ -1,0 +1,388 @@
+"""The real Oxford route: the authors' lidar map, true poses and radar odometry, and what a filter makes of them.
+
+The paper's back end can be run on its own sessions today: the map, the poses that it was judged by and the odometry that
+moved its particles are public, only the measurement, the fake lidar points, is not. So it is an argument here.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from time import perf_counter
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+try:
+    from .geometry import compose, relative_pose
+except ImportError:  # this file was copied on its own
+    from geometry import compose, relative_pose
+
+if TYPE_CHECKING:
+    from .evaluation import FailureRule
+    from .mcl import MapGrid, MclSettings
+    from .motion import MotionModel
+    from .recovery import RecoverySettings, RecoveryUpdate
+
+SCAN_US = 250_000  # scans are 4 Hz; the published files hold no times
+REACH_M = 64.0  # of the radar, by which a pose may lie beside the map
+
+
+class RouteError(ValueError):
+    """Raised where poses, odometry and map do not belong together; names the file and the fault."""
+
+
+@dataclass(frozen=True)
+class Route:
+    """One session of the route.
+
+    Attributes
+    ----------
+    number : str
+        Of the files, such as "02".
+    truth : array, shape (n, 3)
+        True poses T_map_radar [m, m, rad].
+    steps : array, shape (n - 1, 3)
+        The authors' radar odometry: pose of each scan in the one before [m, m, rad].
+    """
+
+    number: str
+    truth: np.ndarray
+    steps: np.ndarray
+
+    @property
+    def stamps_us(self) -> np.ndarray:
+        """Times of the scans as if they had come at 4 Hz exactly, shape (n,) [us]."""
+        return np.arange(len(self.truth), dtype=np.int64) * SCAN_US
+
+    @property
+    def true_steps(self) -> np.ndarray:
+        """True motion between the scans, shape (n - 1, 3) [m, m, rad]."""
+        return relative_pose(self.truth[:-1], self.truth[1:])
+
+
+def list_routes(real_root: Path | str) -> list[str]:
+    """List the numbers of the sessions whose poses and odometry are both there, in order.
+
+    Parameters
+    ----------
+    real_root : path
+        Folder of the real data, see `rol.rall.find_real_root`.
+
+    Returns
+    -------
+    numbers : list of str
+        Such as "01".
+    """
+    from .rall import ODOMETRY_PATH, POSES_PATH
+
+    names = [path.stem.removeprefix("pose_xy_") for path in Path(real_root, POSES_PATH).glob("pose_xy_*.txt")]
+    return sorted(name for name in names if Path(real_root, ODOMETRY_PATH, f"seq{name}_odom.txt").is_file())
+
+
+def load_route(real_root: Path | str, number: str, map_points: np.ndarray) -> Route:
+    """Read one session of the route and check that its parts belong together.
+
+    Parameters
+    ----------
+    real_root : path
+        Folder of the real data.
+    number : str
+        Of the session, such as "02".
+    map_points : array, shape (m, 2)
+        The map, from `rol.rall.load_map_points` [m].
+
+    Returns
+    -------
+    route : Route
+        Where the odometry has one row more than there are steps, as in two of the published files, the last is left
+        out.
+
+    Raises
+    ------
+    RouteError
+        If there are fewer or more odometry rows than that, or a pose is farther off the map's extent than the radar
+        sees.
+    rol.rall.RallError
+        If a file is missing or holds anything but rows of three finite numbers.
+    """
+    from .rall import ODOMETRY_PATH, POSES_PATH, load_odometry, load_poses
+
+    poses_path = Path(real_root, POSES_PATH, f"pose_xy_{number}.txt")
+    odometry_path = Path(real_root, ODOMETRY_PATH, f"seq{number}_odom.txt")
+    truth, steps = load_poses(poses_path), load_odometry(odometry_path)
+    if len(steps) not in (len(truth) - 1, len(truth)):
+        raise RouteError(
+            f"{odometry_path}: {len(steps)} steps for the {len(truth)} poses of {poses_path.name}; {len(truth) - 1} needed"
+        )
+    low, high = map_points.min(axis=0) - REACH_M, map_points.max(axis=0) + REACH_M
+    is_outside = ((truth[:, :2] < low) | (truth[:, :2] > high)).any(axis=1)
+    if is_outside.any():
+        row = int(np.argmax(is_outside))
+        place = ", ".join(f"{value:.1f}" for value in truth[row, :2])
+        raise RouteError(f"{poses_path}: pose {row + 1} at ({place}) m is outside the map")
+    return Route(number, truth, steps[: len(truth) - 1])
+
+
+def learn_from_others(
+    real_root: Path | str, number: str, map_points: np.ndarray
+) -> tuple[MotionModel, str, np.ndarray]:
+    """Learn what the odometry is worth from another session: the mapping session 01 or, for itself, the next one.
+
+    Parameters
+    ----------
+    real_root : path
+        Folder of the real data.
+    number : str
+        Session that is to be localized; nothing is learnt from it.
+    map_points : array, shape (m, 2)
+        The map [m].
+
+    Returns
+    -------
+    model : MotionModel
+        The plain `rol.motion.MotionModel` where there is no other session.
+    teacher : str
+        Number of the session that taught, or "".
+    poses : array, shape (n, 3)
+        Its true poses, at which the front end may be learnt too; those of the session itself where there is no other
+        [m, m, rad].
+    """
+    from .motion import MotionModel, learn_motion
+
+    others = [name for name in list_routes(real_root) if name != number]
+    if not others:
+        return MotionModel(), "", load_route(real_root, number, map_points).truth
+    teacher = load_route(real_root, others[0], map_points)
+    return learn_motion(teacher.steps, teacher.true_steps), teacher.number, teacher.truth
+
+
+@dataclass(frozen=True)
+class RouteRun:
+    """What one run of a filter over a session left, scan by scan.
+
+    Attributes
+    ----------
+    poses : array, shape (n, 3)
+        Estimates T_map_radar [m, m, rad].
+    covariances : array, shape (n, 3, 3)
+        Of the particles about them [m, rad].
+    failures : list of int
+        Scans at which the rule of failures was broken.
+    is_lost : array of bool, shape (n,)
+        The filter said that it was lost; never said by the method `paper`.
+    health : array, shape (n,)
+        See `rol.recovery.RecoveryUpdate`; NaN for the method `paper`.
+    n_particles : array of int, shape (n,)
+        Particles.
+    update_ms : array, shape (n,)
+        Time of each update [ms].
+    """
+
+    poses: np.ndarray
+    covariances: np.ndarray
+    failures: list[int]
+    is_lost: np.ndarray
+    health: np.ndarray
+    n_particles: np.ndarray
+    update_ms: np.ndarray
+
+
+def run_paper(
+    route: Route,
+    clouds: Iterable[np.ndarray],
+    grid: MapGrid,
+    settings: MclSettings,
+    rng: np.random.Generator,
+    rule: FailureRule | None = None,
+) -> RouteRun:
+    """Run the paper's filter: started at the truth, and set back to it by hand after a failure.
+
+    Parameters
+    ----------
+    route : Route
+        The session.
+    clouds : iterable of array, shape (m, 2)
+        One cloud per scan [m].
+    grid : MapGrid
+        From `rol.mcl.build_grid` with the settings.
+    settings : MclSettings
+        Of `rol.mcl.settings_for`.
+    rng : numpy.random.Generator
+        Source of randomness.
+    rule : FailureRule, optional
+        When a run has failed.
+
+    Returns
+    -------
+    run : RouteRun
+        Yin et al. 2020, Sec. III-B and IV-C.
+    """
+    from .evaluation import FailureRule, FailureWatch
+    from .mcl import localize
+    from .recovery import covariance_of
+
+    watch = FailureWatch(route.stamps_us, route.truth, rule or FailureRule())
+    filtering = localize(route.steps, clouds, grid, route.truth[0], settings, rng, watch)
+    rows, times = _gather(filtering, lambda u: (u.pose, covariance_of(u), False, np.nan, len(u.particles)))
+    return RouteRun(*rows[:2], watch.failures, *rows[2:], times)
+
+
+def run_rol(
+    route: Route,
+    clouds: Iterable[np.ndarray],
+    grid: MapGrid,
+    map_points: np.ndarray,
+    settings: MclSettings,
+    recovery: RecoverySettings,
+    model: MotionModel,
+    rng: np.random.Generator,
+    rule: FailureRule | None = None,
+) -> RouteRun:
+    """Run the book's filter: started at the truth, never set back.
+
+    Parameters
+    ----------
+    route, clouds, grid, settings, rng, rule
+        As for `run_paper`; a failure that goes on counts again each time that the rule is broken anew.
+    map_points : array, shape (m, 2)
+        The map [m].
+    recovery : RecoverySettings
+        See there.
+    model : MotionModel
+        Of the odometry, learnt from another session.
+
+    Returns
+    -------
+    run : RouteRun
+    """
+    from .evaluation import FailureRule, FailureWatch
+    from .motion import sample_motion, screen_steps
+    from .recovery import localize_with_recovery
+
+    def move(particles: np.ndarray, step: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+        return sample_motion(particles, step, model, rng)
+
+    watch = FailureWatch(route.stamps_us, route.truth, rule or FailureRule())
+    filtering = localize_with_recovery(
+        screen_steps(route.steps),
+        clouds,
+        map_points,
+        route.truth[0],
+        settings,
+        recovery,
+        move,
+        rng,
+        grid=grid,
+    )
+    rows, times = _gather(
+        filtering, lambda u: (u.filter.pose, u.covariance, u.is_lost, u.health, u.n_particles)
+    )
+    for index, pose in enumerate(rows[0]):
+        watch(index, pose)
+    return RouteRun(*rows[:2], watch.failures, *rows[2:], times)
+
+
+def _gather(filtering: Iterable, read: Callable) -> tuple[list[np.ndarray], np.ndarray]:
+    """Run a filter to its end; give what is read from each update as arrays, and the time of each [ms]."""
+    rows, times, begin = [], [], perf_counter()
+    for update in filtering:
+        times.append(1000.0 * (perf_counter() - begin))
+        rows.append(read(update))
+        begin = perf_counter()
+    return [np.array(column) for column in zip(*rows, strict=True)], np.array(times)
+
+
+def displace(pose: np.ndarray, distance_m: float, turn: float, rng: np.random.Generator) -> np.ndarray:
+    """Carry a pose off by a distance in any direction, and turn it to either side.
+
+    Parameters
+    ----------
+    pose : array, shape (3,)
+        Pose [m, m, rad].
+    distance_m, turn : float
+        How far [m], and by what angle [rad].
+    rng : numpy.random.Generator
+        Source of randomness.
+
+    Returns
+    -------
+    pose : array, shape (3,)
+    """
+    angle = rng.uniform(-np.pi, np.pi)
+    there = compose(pose, np.array([distance_m * np.cos(angle), distance_m * np.sin(angle), 0.0]))
+    return there + np.array([0.0, 0.0, turn * rng.choice([-1.0, 1.0])])
+
+
+@dataclass(frozen=True)
+class RecoveryTrial:
+    """How a filter that began at a wrong place fared.
+
+    Attributes
+    ----------
+    found_s : float
+        Time after which the estimate was right, and stayed so for two seconds [s]; infinite if it never was.
+    told_share : float
+        Share of the scans with a wrong estimate, after the first two seconds, at which it said that it was lost; NaN
+        if there were none.
+    error_m : float
+        Position error at the end [m].
+    is_lost_at_end : bool
+        It said so at the last scan.
+    n_particles : int
+        The most particles at any time.
+    seconds : float
+        Time on the clock that it took [s].
+    """
+
+    found_s: float
+    told_share: float
+    error_m: float
+    is_lost_at_end: bool
+    n_particles: int
+    seconds: float
+
+
+def judge_recovery(
+    updates: Sequence[RecoveryUpdate],
+    truth: np.ndarray,
+    seconds: float = 0.0,
+    *,
+    limits: tuple[float, float] = (1.0, np.deg2rad(5.0)),
+    stay: int = 8,
+) -> RecoveryTrial:
+    """Judge how the pose was found.
+
+    Parameters
+    ----------
+    updates : sequence of RecoveryUpdate
+        From `rol.recovery.localize_with_recovery`.
+    truth : array, shape (n, 3)
+        True poses of the same scans [m, m, rad].
+    seconds : float
+        Time on the clock, to be noted [s].
+    limits : tuple of float
+        An estimate is right within these [m, rad].
+    stay : int
+        For so many scans; two seconds.
+
+    Returns
+    -------
+    trial : RecoveryTrial
+    """
+    poses = np.array([update.filter.pose for update in updates])
+    off = relative_pose(truth[: len(poses)], poses)
+    distance = np.hypot(off[:, 0], off[:, 1])
+    is_right = (distance < limits[0]) & (np.abs(off[:, 2]) < limits[1])
+    is_lost = np.array([update.is_lost for update in updates])
+    stays = np.convolve(is_right, np.ones(stay), "valid") > stay - 0.5 if len(poses) >= stay else np.zeros(1)
+    wrong = ~is_right[stay:]
+    return RecoveryTrial(
+        float(np.argmax(stays) * SCAN_US * 1e-6) if stays.any() else float("inf"),
+        float(is_lost[stay:][wrong].mean()) if wrong.any() else float("nan"),
+        float(distance[-1]),
+        bool(is_lost[-1]),
+        int(max(update.n_particles for update in updates)),
+        seconds,
+    )

@@ -1,0 +1,116 @@
+"""Sessions of the real route: their parts must belong together; how a recovery is judged; drawn points at real poses."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from rol import rall
+from rol.evaluation import pose_errors, rmse
+from rol.motion import MotionModel
+from rol.route import Route, RouteError, displace, judge_recovery, learn_from_others, list_routes, load_route
+from rol.virtual.map_points import FrontEnd
+from rol.virtual.route_runs import add_outliers, draw_session, kidnap, run_method, set_stage
+
+MAP = np.array([[0.0, 0.0], [100.0, 100.0]])
+
+
+def write_route(root: Path, number: str, n: int = 60, n_steps: int | None = None, **places: tuple) -> Path:
+    """Write poses along a line and their steps; `places` moves single poses."""
+    poses = np.column_stack([np.linspace(0.0, 50.0, n), np.full(n, 50.0), np.zeros(n)])
+    for row, place in places.items():
+        poses[int(row[1:]), :2] = place
+    steps = np.tile([50.0 / (n - 1), 0.0, 0.0], ((n - 1) if n_steps is None else n_steps, 1))
+    for path, rows in (
+        (root / rall.POSES_PATH / f"pose_xy_{number}.txt", poses),
+        (root / rall.ODOMETRY_PATH / f"seq{number}_odom.txt", steps),
+    ):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        np.savetxt(path, rows)
+    return root
+
+
+def test_a_session_is_read_with_or_without_its_last_row(tmp_path: Path) -> None:
+    for number, n_steps in (("03", 59), ("04", 60)):
+        route = load_route(write_route(tmp_path, number, n_steps=n_steps), number, MAP)
+        assert route.truth.shape == (60, 3) and route.steps.shape == (59, 3)
+        np.testing.assert_allclose(route.true_steps, route.steps, atol=1e-6)
+        assert np.diff(route.stamps_us).tolist() == [250_000] * 59
+    assert list_routes(tmp_path) == ["03", "04"]
+
+
+def test_parts_that_do_not_belong_together_are_named(tmp_path: Path) -> None:
+    with pytest.raises(
+        RouteError, match=r"seq03_odom.txt: 57 steps for the 60 poses of pose_xy_03.txt; 59 needed"
+    ):
+        load_route(write_route(tmp_path, "03", n_steps=57), "03", MAP)
+    with pytest.raises(RouteError, match=r"pose_xy_05.txt: pose 8 at \(900.0, 1.0\) m is outside the map"):
+        load_route(write_route(tmp_path, "05", p7=(900.0, 1.0)), "05", MAP)
+    with pytest.raises(rall.RallError, match=r"pose_xy_06.txt: row 3 is not finite"):
+        load_route(write_route(tmp_path, "06", p2=(np.nan, 1.0)), "06", MAP)
+    with pytest.raises(rall.RallError, match=r"pose_xy_99.txt: missing"):
+        load_route(tmp_path, "99", MAP)
+
+
+def test_motion_is_learnt_from_another_session_if_there_is_one(tmp_path: Path) -> None:
+    root = write_route(tmp_path, "03")
+    model, teacher, poses = learn_from_others(root, "03", MAP)
+    assert model == MotionModel() and teacher == "" and len(poses) == 60
+    model, teacher, _ = learn_from_others(write_route(root, "01", n=80), "03", MAP)
+    assert teacher == "01" and model != MotionModel()
+
+
+@dataclass
+class Told:
+    """As much of an update as is judged."""
+
+    pose: np.ndarray
+    is_lost: bool
+    n_particles: int = 7
+
+    @property
+    def filter(self) -> SimpleNamespace:
+        return SimpleNamespace(pose=self.pose)
+
+
+def test_recovery_is_judged_by_the_first_estimate_that_stays_right() -> None:
+    truth, wrong, right = np.zeros((40, 3)), np.array([9.0, 0.0, 0.0]), np.array([0.5, 0.0, 0.0])
+    updates = [Told(right if k in (3, 4) or k >= 20 else wrong, is_lost=k < 14) for k in range(40)]
+    trial = judge_recovery(updates, truth)
+    assert trial.found_s == 5.0  # scans 3 and 4 did not last
+    assert trial.told_share == pytest.approx(6 / 12)  # of scans 8 to 19
+    assert trial.error_m == 0.5 and not trial.is_lost_at_end and trial.n_particles == 7
+    never = judge_recovery([Told(wrong, True)] * 40, truth)
+    assert never.found_s == np.inf and never.told_share == 1.0
+
+
+def test_displaced_poses_are_as_far_off_as_asked() -> None:
+    rng, pose = np.random.default_rng(1), np.array([3.0, 4.0, 0.5])
+    off = np.array([displace(pose, 20.0, 0.3, rng) for _ in range(50)]) - pose
+    np.testing.assert_allclose(np.hypot(off[:, 0], off[:, 1]), 20.0)
+    assert set(np.round(off[:, 2], 9)) == {-0.3, 0.3} and np.ptp(np.arctan2(off[:, 1], off[:, 0])) > 4.0
+
+
+def test_outliers_are_as_many_as_asked() -> None:
+    route = Route("09", np.zeros((4001, 3)), np.zeros((4000, 3)))
+    steps = add_outliers(route, 0.05, np.random.default_rng(2)).steps
+    lengths = np.hypot(steps[:, 0], steps[:, 1])
+    assert np.mean(lengths > 0.0) == pytest.approx(0.05, abs=0.01)
+    assert lengths[lengths > 0.0].min() >= 0.5 and lengths.max() <= 2.0 and not route.steps.any()
+
+
+@pytest.mark.slow
+def test_the_real_route_is_held_and_found_again(real_root: Path) -> None:
+    stage = set_stage(real_root, "02", FrontEnd(), max_scans=400)
+    clouds = draw_session(stage, 1)
+    spoiled = add_outliers(stage.route, 0.015, np.random.default_rng(1))
+    for part in (stage, type(stage)(**{**vars(stage), "route": spoiled})):
+        run = run_method(part, "rol", clouds, 1)
+        errors = pose_errors(run.poses, stage.route.truth)
+        assert rmse(errors.position_m) < 0.3 and not run.failures and run.is_lost.mean() < 0.1
+    paper = run_method(stage, "paper", clouds, 1)
+    assert np.isnan(paper.health).all() and not paper.is_lost.any() and len(paper.poses) == 400
+    trial, updates, heard = kidnap(stage, 300, 1)
+    assert trial.found_s <= 10.0 and trial.told_share > 0.8 and len(updates) == len(heard) == 60
