@@ -1,6 +1,6 @@
 """Measure the filter on the real route over many seeds, settings and lost starts: hours of filtering, kept as tables.
 
-python workflow/measure_route.py [--real-root DIR] [--jobs 2] [--only seeds,settings,fronts,outliers,kidnapped,anywhere]
+python workflow/measure_route.py [--real-root DIR] [--jobs 2] [--only seeds,settings,...]
 
 Writes data/ablations/route_<what>.csv row by row: a run that was stopped goes on where it ended. Chapter 09 reads these
 tables, and makes one run of each session itself.
@@ -24,7 +24,7 @@ import pandas as pd
 
 from rol.evaluation import consistency, pose_errors, summarize, write_text
 from rol.rall import find_real_root
-from rol.route import RouteRun, list_routes
+from rol.route import Route, RouteRun, list_routes
 from rol.virtual.map_points import FrontEnd
 from rol.virtual.route_runs import (
     Stage,
@@ -124,6 +124,22 @@ def measure_outliers(real_root: str, number: str, share: float, seed: int) -> li
     ]
 
 
+def measure_rendered(real_root: str, number: str, first: int, n_scans: int, seed: int) -> list[dict]:
+    """Both methods with the virtual radar through the translator, on a stretch where it never learnt."""
+    import torch
+
+    from rol.front_ends import load_translator
+    from rol.virtual.rendered import render_clouds
+
+    torch.set_num_threads(1)
+    stage = stage_of(real_root, number, (0.80, 0.88))
+    translator = load_translator(ROOT / "data" / "weights" / "rol.safetensors")
+    clouds = list(render_clouds(real_root, number, first, n_scans, translator, seed))
+    truth, steps = stage.route.truth[first : first + n_scans], stage.route.steps[first : first + n_scans - 1]
+    part = replace(stage, route=Route(number, truth, steps))
+    return [row_of(part, run_method(part, method, clouds, seed), method, seed) for method in ("paper", "rol")]
+
+
 def measure_trial(what: str):
     """Give the measure of one lost start."""
 
@@ -141,6 +157,7 @@ MEASURES = {
     "settings": measure_settings,
     "fronts": measure_fronts,
     "outliers": measure_outliers,
+    "rendered": measure_rendered,
     "kidnapped": measure_trial("kidnapped"),
     "anywhere": measure_trial("anywhere"),
 }
@@ -165,6 +182,7 @@ def list_jobs(real_root: str) -> dict[str, list[tuple]]:
         "settings": [(first, seed) for seed in (1, 2, 3)],
         "outliers": [(first, share, seed) for share in (0.015, 0.05) for seed in (1, 2, 3)],
         "fronts": [(first, *shares, seed) for shares in FRONTS for seed in (1, 2, 3)],
+        "rendered": [key for key in (("02", 6000, 400, 1), ("07", 5050, 400, 1)) if key[0] in numbers],
         "anywhere": places(50, 120),
     }
 

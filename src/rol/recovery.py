@@ -16,6 +16,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -23,8 +24,6 @@ try:
     from .geometry import check_poses, wrap_angle
 except ImportError:  # this file was copied on its own
     from geometry import check_poses, wrap_angle
-
-from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from .mcl import MapGrid, MclSettings, MclUpdate
@@ -232,6 +231,7 @@ class _State:
     moved_m: float = 0.0
     well_m: float = 0.0
     searched_m: float = 1e9
+    coarse: MapGrid | None = None
 
 
 def localize_with_recovery(
@@ -282,58 +282,69 @@ def localize_with_recovery(
     rol.mcl.MclError
         If there are fewer steps than clouds ask for, or an input is no cloud, no pose or no map.
     """
-    from .mcl import MclError, build_distance_grid, build_grid, sample_particles, update
-    from .search import measure_excess
+    from .mcl import MclError, build_grid, sample_particles, update
 
     grid = build_grid(map_points, settings) if grid is None else grid
-    coarse = None
     spreads = settings.start_spread_m, settings.start_spread_yaw_rad
     particles = sample_particles(start, settings.n_particles, *spreads, rng)
-    state = _begin(particles, recovery, is_start_known)
-    steps = iter(steps)
+    state, steps = _begin(particles, recovery, is_start_known), iter(steps)
     for index, points in enumerate(clouds):
         step = np.zeros(3) if index == 0 else next(steps, None)
         if step is None:
             raise MclError(f"no odometry step to scan {index}: one fewer than clouds are needed")
         if index > 0:
-            state.particles = move(state.particles, step, rng)
-            state.steps.append(move_mean(step, move))
-            length = float(np.hypot(*state.steps[-1][:2]))
-            state.moved_m, state.well_m, state.searched_m = (
-                state.moved_m + length, state.well_m + length, state.searched_m + length
-            )  # fmt: skip
-            state.rivals = _move_rivals(state.rivals, step, move, rng)
+            _move_all(state, step, move, rng)
         result = update(index, state.particles, state.weights, points, grid, settings, rng)
-        state.clouds.append(points[np.hypot(points[:, 0], points[:, 1]) < recovery.max_range_m])
-        excess = float(measure_excess(result.pose[None], points, grid)[0])
-        state.rivals, of_rivals = _weigh_rivals(state.rivals, points, grid, settings.exponent, rng)
-        _note_excess(state, excess, of_rivals, recovery)
-        state.rivals = _merge_rivals(state.rivals, result.pose)
-        health = _health(state, recovery)
-        best = _best_rival(state, recovery)
-        state.n_lost = state.n_lost + 1 if health < recovery.lost else 0
-        state.is_far = (state.is_far and not state.is_trusted) or state.n_lost > recovery.far_after
-        is_lost = state.is_far or health < recovery.lost or best is not None
-        winner = _decide(state, recovery)
-        yield RecoveryUpdate(
-            result,
-            covariance_of(result),
-            excess,
-            health,
-            is_lost,
-            len(state.rivals),
-            len(result.particles) + state.rivals.weights.size,
-            winner is not None,
-        )
+        told, winner = _watch(state, result, points, grid, settings, recovery, rng)
+        yield told
         state.particles, state.weights = result.next_particles, result.next_weights
         if winner is not None:
             _enthrone(state, winner, settings, rng)
-        elif health < recovery.doubt or state.is_far:
-            if state.is_far and coarse is None:
-                coarse = build_distance_grid(map_points, 0.45, 1.0)
-            _search(state, result.pose, grid, coarse, recovery, rng)
-        elif len(state.rivals):
+        elif told.health < recovery.doubt or state.is_far:
+            _search(state, result.pose, map_points, grid, recovery, rng)
+        else:
             state.rivals = state.rivals.keep(state.rivals.ages < recovery.trial)
+
+
+def _move_all(state: _State, step: np.ndarray, move: Move, rng: np.random.Generator) -> None:
+    """Move the filter's particles and those of its rivals, and note how far the car went."""
+    state.particles = move(state.particles, step, rng)
+    state.steps.append(move_mean(step, move))
+    length = float(np.hypot(*state.steps[-1][:2]))
+    state.moved_m += length
+    state.well_m += length
+    state.searched_m += length
+    state.rivals = _move_rivals(state.rivals, step, move, rng)
+
+
+def _watch(
+    state: _State,
+    result: MclUpdate,
+    points: np.ndarray,
+    grid: MapGrid,
+    settings: MclSettings,
+    recovery: RecoverySettings,
+    rng: np.random.Generator,
+) -> tuple[RecoveryUpdate, int | None]:
+    """Hold the estimate against chance and against its rivals; say what to think of it, and which rival takes over."""
+    from .search import measure_excess
+
+    state.clouds.append(points[np.hypot(points[:, 0], points[:, 1]) < recovery.max_range_m])
+    excess = float(measure_excess(result.pose[None], points, grid)[0])
+    state.rivals, of_rivals = _weigh_rivals(state.rivals, points, grid, settings.exponent, rng)
+    _note_excess(state, excess, of_rivals, recovery)
+    state.rivals = _merge_rivals(state.rivals, result.pose)
+    health = _health(state, recovery)
+    state.n_lost = state.n_lost + 1 if health < recovery.lost else 0
+    state.is_far = (state.is_far and not state.is_trusted) or state.n_lost > recovery.far_after
+    is_lost = state.is_far or health < recovery.lost or _best_rival(state, recovery) is not None
+    winner, n_rivals = _decide(state, recovery), len(state.rivals)
+    n_particles = len(result.particles) + state.rivals.weights.size
+    covariance = covariance_of(result)
+    told = RecoveryUpdate(
+        result, covariance, excess, health, is_lost, n_rivals, n_particles, winner is not None
+    )
+    return told, winner
 
 
 def move_mean(step: np.ndarray, move: Move) -> np.ndarray:
@@ -424,12 +435,12 @@ def _health(state: _State, recovery: RecoverySettings) -> float:
 
 def _merge_rivals(rivals: Rivals, pose: np.ndarray) -> Rivals:
     """Drop rivals that have come to where the estimate or a better rival is."""
-    from .search import _keep_apart
+    from .search import keep_apart
 
     if not len(rivals):
         return rivals
     known, worth = np.vstack([pose[None], rivals.poses]), np.append(np.inf, rivals.means)
-    kept = _keep_apart(known, np.argsort(-worth, kind="stable"), len(known), (1.0, np.deg2rad(3.0)))
+    kept = keep_apart(known, np.argsort(-worth, kind="stable"), len(known), (1.0, np.deg2rad(3.0)))
     return rivals.keep(np.array(sorted(kept)[1:], dtype=int) - 1)
 
 
@@ -480,12 +491,13 @@ def _enthrone(state: _State, winner: int, settings: MclSettings, rng: np.random.
 def _search(
     state: _State,
     pose: np.ndarray,
+    map_points: np.ndarray,
     grid: MapGrid,
-    coarse: MapGrid | None,
     recovery: RecoverySettings,
     rng: np.random.Generator,
 ) -> None:
     """Search for rivals, if it is time, and follow the new ones beside the best of the old."""
+    from .mcl import build_distance_grid
     from .search import drop_riders, join_clouds, search_poses
 
     pause = recovery.trusted_pause if state.is_trusted else recovery.pause
@@ -500,7 +512,9 @@ def _search(
     n = recovery.n_far_rivals if state.is_far else recovery.n_rivals
     if state.is_far:
         how = {"reach_m": recovery.far_m, "yaw_step": np.deg2rad(2.0), "n_looked_at": 9000, "n_best": n}
-        found, _ = search_poses(points, coarse, grid, pose, workers=recovery.workers, **how)
+        if state.coarse is None:
+            state.coarse = build_distance_grid(map_points, 0.45, 1.0)  # a wide Gaussian for wide cells
+        found, _ = search_poses(points, state.coarse, grid, pose, workers=recovery.workers, **how)
     else:
         how = {"reach_m": recovery.reach_m, "reach_yaw": recovery.reach_yaw, "n_best": n}
         found, _ = search_poses(points, grid, grid, pose, workers=recovery.workers, **how)

@@ -238,7 +238,7 @@ def search_poses(
     few = points[np.linspace(0, len(points) - 1, min(len(points), max_points)).astype(int)]
     poses = _look_closer(rough, few, fine, coarse.cell / 4.0, yaw_step / 4.0)
     excess = measure_excess(poses, few, fine)
-    kept = _keep_apart(poses, np.argsort(-excess, kind="stable"), n_best, apart)
+    kept = keep_apart(poses, np.argsort(-excess, kind="stable"), n_best, apart)
     poses[:, 2] = wrap_angle(poses[:, 2])
     return poses[kept], excess[kept]
 
@@ -272,8 +272,25 @@ def _look_closer(
     return tried[np.arange(len(poses)), best]
 
 
-def _keep_apart(poses: np.ndarray, order: np.ndarray, n: int, apart: tuple[float, float]) -> list[int]:
-    """Go through poses in an order, and keep those that are not near one kept before."""
+def keep_apart(poses: np.ndarray, order: np.ndarray, n: int, apart: tuple[float, float]) -> list[int]:
+    """Go through poses in an order, and keep those that are not near one kept before.
+
+    Parameters
+    ----------
+    poses : array, shape (k, 3)
+        Poses [m, m, rad].
+    order : array of int
+        Numbers of the poses, the first to be kept first.
+    n : int
+        How many to keep at most.
+    apart : tuple of float
+        Two poses nearer together than this, in x and y [m] and in heading [rad], are the same.
+
+    Returns
+    -------
+    kept : list of int
+        Numbers of those kept, in the order given.
+    """
     kept: list[int] = []
     for i in order:
         away = poses[kept] - poses[i]
