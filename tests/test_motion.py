@@ -34,7 +34,21 @@ def test_errors_that_go_on_count_as_what_they_become() -> None:
     models = [
         learn_motion(true + np.column_stack([error, 0 * error, 0 * error]), true) for error in (once, lasting)
     ]
-    assert models[1].still[0] > 1.5 * models[0].still[0]
+    at_1m = [model.driving[0] + model.moving[0] for model in models]
+    assert at_1m[1] > 1.5 * at_1m[0]
+
+
+def test_the_drift_of_a_standing_car_is_not_believed() -> None:
+    rng = np.random.default_rng(5)
+    true = drive(rng)
+    is_still = true[:, 0] == 0.0
+    told = true + rng.normal(0.0, (0.02, 0.01, 0.0005), true.shape)
+    told[is_still, 2] += np.repeat(
+        rng.normal(0.0, 0.002, 10), 100
+    )  # it turns while it stands, as the real one does
+    model = learn_motion(told, true)
+    assert model.still[2] < 0.002 and abs(correct_step(np.array([0.01, 0.0, 0.002]), model)[2]) < 0.0005
+    assert correct_step(np.array([1.0, 0.0, 0.002]), model)[2] == pytest.approx(0.002, abs=0.001)
 
 
 def test_a_step_is_corrected_and_its_noise_drawn() -> None:
@@ -49,7 +63,7 @@ def test_a_step_is_corrected_and_its_noise_drawn() -> None:
     start = np.tile([5.0, 5.0, np.pi / 2.0], (20_000, 1))
     moved = sample_motion(start, np.array([2.0, 0.0, 0.0]), model, np.random.default_rng(3))
     assert moved[:, 1].mean() == pytest.approx(7.2, abs=0.01) and moved[:, 0] == pytest.approx(5.0)
-    assert moved[:, 1].std() == pytest.approx(0.1 + 2.2 * 0.1, rel=0.03)  # driving, and for each metre
+    assert moved[:, 1].std() == pytest.approx(0.1 + 2.0 * 0.1, rel=0.03)  # driving, and for each metre
     moved = sample_motion(start, np.array([0.05, 0.0, 0.0]), model, np.random.default_rng(3))
     assert moved[:, 1].std() == pytest.approx(0.5, rel=0.03)
 

@@ -177,13 +177,13 @@ def list_jobs(real_root: str) -> dict[str, list[tuple]]:
 
     first = driven[0]
     return {
-        "seeds": [(number, seed) for number in numbers for seed in range(1, 11)],
+        "seeds": [(number, seed) for seed in range(1, 11) for number in numbers],
         "kidnapped": places(100, 15),
         "settings": [(first, seed) for seed in (1, 2, 3)],
         "outliers": [(first, share, seed) for share in (0.015, 0.05) for seed in (1, 2, 3)],
+        "anywhere": places(50, 120),
         "fronts": [(first, *shares, seed) for shares in FRONTS for seed in (1, 2, 3)],
         "rendered": [key for key in (("02", 6000, 400, 1), ("07", 5050, 400, 1)) if key[0] in numbers],
-        "anywhere": places(50, 120),
     }
 
 

@@ -54,7 +54,7 @@ class RecoverySettings:
         And by this share better than every other rival: a street that is like itself gives no answer, so wait. The
         second holds for rivals from far, of which there are many more.
     trust_m : float
-        After so long a way in good health an estimate is trusted [m].
+        After so long a way in good health an estimate is trusted, until a rival takes its place [m].
     moved_m : float
         A scan counts, for an estimate that has been in good health, when the car has moved so far since the last one
         that did [m].
@@ -335,7 +335,6 @@ def _watch(
     _note_excess(state, excess, of_rivals, recovery)
     state.rivals = _merge_rivals(state.rivals, result.pose)
     health = _health(state, recovery)
-    state.n_lost = state.n_lost + 1 if health < recovery.lost else 0
     state.is_far = (state.is_far and not state.is_trusted) or state.n_lost > recovery.far_after
     is_lost = state.is_far or health < recovery.lost or _best_rival(state, recovery) is not None
     winner, n_rivals = _decide(state, recovery), len(state.rivals)
@@ -423,9 +422,8 @@ def _note_excess(state: _State, own: float, of_rivals: np.ndarray, recovery: Rec
     health = _health(state, recovery)
     if len(state.scores) < recovery.scans or health < recovery.doubt:
         state.well_m = 0.0
-    state.is_trusted = health > (recovery.lost if state.is_trusted else recovery.doubt) and (
-        state.is_trusted or state.well_m > recovery.trust_m
-    )
+    state.is_trusted = state.is_trusted or state.well_m > recovery.trust_m
+    state.n_lost = state.n_lost + 1 if health < recovery.lost else 0
 
 
 def _health(state: _State, recovery: RecoverySettings) -> float:
