@@ -9,12 +9,21 @@ import pytest
 
 from rol import rall
 from rol.evaluation import pose_errors, rmse
-from rol.motion import MotionModel
-from rol.route import Route, RouteError, displace, judge_recovery, learn_from_others, list_routes, load_route
+from rol.route import (
+    Route,
+    RouteError,
+    displace,
+    judge_recovery,
+    learn_from_others,
+    list_routes,
+    load_route,
+    published_motion,
+)
 from rol.virtual.map_points import FrontEnd
 from rol.virtual.route_runs import add_outliers, draw_session, kidnap, run_method, set_stage
 
 MAP = np.array([[0.0, 0.0], [100.0, 100.0]])
+MAP_ALL = np.array([[-2000.0, -2000.0], [2000.0, 2000.0]])  # holds any route
 
 
 def write_route(root: Path, number: str, n: int = 60, n_steps: int | None = None, **places: tuple) -> Path:
@@ -57,9 +66,20 @@ def test_parts_that_do_not_belong_together_are_named(tmp_path: Path) -> None:
 def test_motion_is_learnt_from_another_session_if_there_is_one(tmp_path: Path) -> None:
     root = write_route(tmp_path, "03")
     model, teacher, poses = learn_from_others(root, "03", MAP)
-    assert model == MotionModel() and teacher == "" and len(poses) == 60
+    assert model == published_motion() and teacher == "" and len(poses) == 60
     model, teacher, _ = learn_from_others(write_route(root, "01", n=80), "03", MAP)
-    assert teacher == "01" and model != MotionModel()
+    assert teacher == "01" and model != published_motion()
+
+
+def test_the_published_odometry_is_what_session_01_teaches(real_root: Path) -> None:
+    taught, kept = learn_from_others(real_root, "02", MAP_ALL)[0], published_motion()
+    for name in ("still", "driving", "moving"):
+        np.testing.assert_allclose(getattr(kept, name), getattr(taught, name), atol=0.002)
+    for name in ("matrix", "still_matrix"):
+        np.testing.assert_allclose(
+            np.diag(getattr(kept, name))[[0, 2]], np.diag(getattr(taught, name))[[0, 2]], atol=0.01
+        )
+    assert kept.matrix[1][2] == pytest.approx(taught.matrix[1][2], abs=0.05)
 
 
 @dataclass
