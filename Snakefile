@@ -95,13 +95,14 @@ rule book:
         sources=[f"notebooks/{chapter}.ipynb" for chapter in chapters.CHAPTERS],
         pages=[str(path) for path in sorted(Path("book").rglob("*")) if path.is_file()],
         modules=[str(path) for path in sorted(Path("src/rol").rglob("*.py"))],
-        stage="workflow/stage_book.py",
+        stage=["workflow/stage_book.py", "workflow/toolbox_pages.py"],
     output:
         f"{BOOK}/_build/html/index.html",
     log:
         f"{OUT}/logs/book.log",
     params:
         config=json.dumps(config, sort_keys=True),
+        repository=os.environ.get("ROL_REPOSITORY_URL", ""),
     message:
         "the book in {BOOK}"
     shell:

@@ -128,6 +128,26 @@ def test_distance_grid_by_hand():
     assert grid.values[0, 0] == 0
 
 
+def test_a_point_counts_less_where_the_map_is_full():
+    lone, full = (
+        np.array([[0.125, 0.125]]),
+        np.stack(np.meshgrid(*[np.arange(0.125, 8.0, 0.25)] * 2), axis=-1),
+    )
+    points = np.concatenate([lone, full.reshape(-1, 2) + (20.0, 0.0)])
+    grid = mcl.build_distance_grid(points, 0.2, 0.25, crowd_m=2.0)
+    plain = mcl.build_distance_grid(points, 0.2, 0.25)
+    np.testing.assert_allclose(grid.origin, plain.origin)
+
+    def value(grid, x, y):
+        i, j = np.floor((np.array([x, y]) - grid.origin) / 0.25).astype(int)
+        return int(grid.values[i, j])
+
+    assert value(plain, 24.1, 4.1) == value(plain, 0.1, 0.1) == 255
+    assert value(grid, 24.1, 4.1) == round(255 / (1 + 1 / 0.6))  # all of the square is matched
+    assert value(grid, 0.1, 0.1) > 245
+    assert ((grid.values > 0) <= (plain.values > 0)).all()
+
+
 def test_an_empty_map_is_an_error():
     for build in (mcl.build_matched_grid, mcl.build_distance_grid):
         with pytest.raises(mcl.MclError, match="the map holds no point"):

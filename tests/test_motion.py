@@ -5,7 +5,7 @@ import pytest
 
 from rol import rall
 from rol.geometry import relative_pose
-from rol.motion import MotionModel, correct_step, learn_motion, sample_motion, screen_steps
+from rol.motion import MotionModel, correct_step, learn_motion, mover, sample_motion, screen_steps
 
 
 def drive(rng: np.random.Generator, n: int = 4000) -> np.ndarray:
@@ -20,10 +20,13 @@ def test_scale_and_noise_are_found() -> None:
     true = drive(rng)
     told = true * (0.98, 1.0, 1.0) + rng.normal(0.0, (0.05, 0.02, 0.002), true.shape)
     told[::97, 0] += 1.5  # one gross error in a hundred
-    model = learn_motion(told, true)
+    model = learn_motion(told, true, caution=1.0)
     assert model.matrix[0][0] == pytest.approx(1.0 / 0.98, abs=0.005)
     assert model.matrix[2][2] == pytest.approx(1.0, abs=0.03)
     assert model.still[0] == pytest.approx(0.05, rel=0.5) and model.still[2] == pytest.approx(0.002, rel=0.5)
+    wary = learn_motion(told, true, caution=3.0)
+    assert wary.matrix == model.matrix
+    np.testing.assert_allclose(np.array(wary.driving), 3.0 * np.array(model.driving))
 
 
 def test_errors_that_go_on_count_as_what_they_become() -> None:
@@ -106,3 +109,13 @@ def test_steps_that_no_car_makes_are_replaced() -> None:
 def test_a_change_that_lasts_is_believed() -> None:
     steps = np.array([[0.0, 0.0, 0.0]] + [[2.0, 0.0, 0.0]] * 6)  # it was the first step that erred
     assert np.array(list(screen_steps(steps)))[:, 0].tolist() == [0.0, 0.0, 0.0, 0.0, 2.0, 2.0, 2.0]
+
+
+def test_a_mover_moves_as_its_model_does() -> None:
+    model, particles, step = (
+        MotionModel(driving=(0.2, 0.1, 0.01)),
+        np.zeros((50, 3)),
+        np.array([1.0, 0.0, 0.1]),
+    )
+    moved = mover(model)(particles, step, np.random.default_rng(4))
+    np.testing.assert_array_equal(moved, sample_motion(particles, step, model, np.random.default_rng(4)))

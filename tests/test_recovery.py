@@ -89,6 +89,17 @@ def test_scans_without_points_leave_the_filter_to_the_odometry(drive: tuple) -> 
     assert off.max() < 1.0 and not updates[22].filter.is_informed
 
 
+def test_a_standing_car_learns_slowly(drive: tuple) -> None:
+    points, poses, _, clouds = drive
+    stood = (points, np.repeat(poses[:1], 12, axis=0), np.zeros((11, 3)), clouds[:1] * 12)
+
+    def ess(share: float) -> float:  # by how little the weights of the second scan differ
+        _, updates = run(stood, poses[0], still_share=share)
+        return updates[1].filter.ess / len(updates[1].filter.particles)
+
+    assert ess(0.1) > 1.5 * ess(1.0)
+
+
 def test_bad_input_is_refused(drive: tuple) -> None:
     points, poses, steps, clouds = drive
     with pytest.raises(MclError, match="no odometry step to scan 5"):

@@ -6,16 +6,18 @@ python workflow/stage_book.py --where config/demo.yaml   only says where the bui
 
 from __future__ import annotations
 
-import ast
 import base64
 import datetime
 import importlib.metadata
+import os
 import platform
 import re
 import shutil
 import subprocess
 import sys
+from collections.abc import Mapping
 from pathlib import Path
+from urllib.parse import urlsplit
 
 import nbformat
 import yaml
@@ -23,7 +25,6 @@ import yaml
 from chapters import (
     CHAPTERS,
     NOTEBOOKS,
-    PACKAGE,
     ROOT,
     ChapterError,
     Run,
@@ -33,10 +34,11 @@ from chapters import (
     load_run,
     tagged_cells,
 )
+from toolbox_pages import stage_toolbox
 
 VERSIONS_SHOWN = "numpy scipy opencv-python-headless numba pandas torch open3d-cpu matplotlib papermill snakemake jupyter-book"
-# The picture of the first page, taken from a run: chapter, and the name of the figure in it.
-RESULT_FIGURE = ("07_localization", "fig-trajectory")
+# The picture of the first page is taken from a run: the first of these that there is, and what the page says of it.
+RESULT_FIGURES = (("10_real_radar", "fig-story", "real.md"), ("07_localization", "fig-trajectory", "virtual.md"))
 
 
 # ---- notebooks ------------------------------------------------------------------------------------------------
@@ -107,10 +109,13 @@ def relabel(notebook: nbformat.NotebookNode, suffix: str) -> None:
 
 
 def point_to_pages(text: str, pages: dict[str, Run]) -> str:
-    """Point links between chapters to the pages of the book: a chapter shown several times to its first page."""
+    """Point links between chapters to the pages of the book: a chapter shown several times to its first page.
+
+    Links and glued numbers only: a command keeps the name of the notebook's file.
+    """
     for chapter in CHAPTERS:
         first = next(page for page, run in pages.items() if run.chapter == chapter)
-        text = re.sub(rf"(?<![\w-]){chapter}(\.ipynb|\.md)", rf"{first}\1", text)
+        text = re.sub(rf"(?<![\w-]){chapter}(?=\.ipynb(?:::|[)#>]))", first, text)
     return text
 
 
@@ -134,17 +139,26 @@ def stage_notebooks(config: dict, book: Path) -> None:
         nbformat.write(notebook, book / "notebooks" / f"{page}.ipynb")
 
 
-def stage_result_figure(config: dict, book: Path) -> None:
-    """Write the picture of the first page from the run that shows it."""
-    chapter, name = RESULT_FIGURE
-    run = next(run for run in book_pages(config).values() if run.chapter == chapter)
-    for cell in nbformat.read(run.path(config["out_dir"]), as_version=4).cells:
+def read_figure(notebook: Path, name: str) -> bytes | None:
+    """Take the PNG of a named figure out of an executed notebook; none where the run drew none."""
+    for cell in nbformat.read(notebook, as_version=4).cells:
         if cell.metadata.get("mystnb", {}).get("figure", {}).get("name") == name:
             for output in cell.outputs:
                 if "image/png" in output.get("data", {}):
-                    (book / "images").mkdir(exist_ok=True)
-                    (book / "images" / "result.png").write_bytes(base64.b64decode(output.data["image/png"]))
-                    return
+                    return base64.b64decode(output.data["image/png"])
+    return None
+
+
+def stage_result_figure(config: dict, book: Path) -> None:
+    """Write the picture of the first page, and the words below it: real data where they are at hand, else virtual."""
+    for chapter, name, words in RESULT_FIGURES:
+        run = next((run for run in book_pages(config).values() if run.chapter == chapter), None)
+        png = read_figure(run.path(config["out_dir"]), name) if run else None
+        if png:
+            (book / "images").mkdir(exist_ok=True)
+            (book / "images" / "result.png").write_bytes(png)
+            shutil.copy(book / "images" / words, book / "picture.md")
+            return
     raise ChapterError(f"notebooks/{chapter}.ipynb: no PNG figure named {name}, which the first page shows")
 
 
@@ -169,62 +183,55 @@ def expand_contents(contents: dict, pages: dict[str, Run], modules: list[str]) -
     return contents
 
 
+# ---- launch buttons -------------------------------------------------------------------------------------------
+
+
+def launch_settings(environment: Mapping[str, str]) -> dict:
+    """Give the settings of the button that opens a chapter on Binder; none where no address of the repository is known.
+
+    Binder builds `environment.yml` with the whole repository around the notebook; what earlier chapters hand on is made
+    there by `snakemake -c2 chapters` in a terminal. Colab opens a notebook alone, so no chapter would run there.
+
+    Parameters
+    ----------
+    environment : mapping
+        ``ROL_REPOSITORY_URL``, ``ROL_REPOSITORY_BRANCH`` ("main") and ``ROL_BINDERHUB_URL`` ("https://mybinder.org").
+
+    Returns
+    -------
+    settings : dict
+        Keys of `_config.yml`.
+
+    Raises
+    ------
+    ChapterError
+        If an address is not one that a browser can open.
+    """
+    addresses = {
+        "ROL_REPOSITORY_URL": environment.get("ROL_REPOSITORY_URL", ""),
+        "ROL_BINDERHUB_URL": environment.get("ROL_BINDERHUB_URL", "") or "https://mybinder.org",
+    }
+    if not addresses["ROL_REPOSITORY_URL"]:
+        return {}
+    for name, address in addresses.items():
+        if urlsplit(address).scheme not in ("http", "https") or not urlsplit(address).netloc:
+            raise ChapterError(f"{name}: not an address that begins with https:// ({address})")
+    repository, hub = (address.rstrip("/").removesuffix(".git") for address in addresses.values())
+    return {
+        "repository": {"url": repository, "branch": environment.get("ROL_REPOSITORY_BRANCH", "") or "main"},
+        "launch_buttons": {"notebook_interface": "jupyterlab", "binderhub_url": hub},
+    }
+
+
+def stage_settings(book: Path, environment: Mapping[str, str]) -> None:
+    """Complete the staged `_config.yml` by what this build knows; with nothing to add it stays as it is."""
+    more = launch_settings(environment)
+    if more:
+        path = book / "_config.yml"
+        path.write_text(yaml.safe_dump(yaml.safe_load(path.read_text()) | more, sort_keys=False))
+
+
 # ---- generated pages ------------------------------------------------------------------------------------------
-
-
-def as_text(docstring: str) -> str:
-    """Make MyST show a docstring's words as they stand: only code in backticks keeps its meaning."""
-    parts = re.split(r"(``?[^`]+``?)", docstring)
-    return "".join(p if i % 2 else re.sub(r"([\\*_|<>\[\]{}$#~])", r"\\\1", p) for i, p in enumerate(parts))
-
-
-def public_members(file: Path) -> list[tuple[str, str]]:
-    """List the public functions and classes of a file with the first paragraph of their docstrings."""
-    tree = ast.parse(file.read_text())
-    kinds = ast.FunctionDef | ast.ClassDef
-    return [
-        (node.name, " ".join((ast.get_docstring(node) or "").split("\n\n")[0].split()))
-        for node in tree.body
-        if isinstance(node, kinds) and not node.name.startswith("_")
-    ]
-
-
-def module_page(file: Path) -> str:
-    """Write the page of one module: what it holds, and every function in full, ready to copy."""
-    place = file.relative_to(PACKAGE)
-    name = ".".join(place.with_suffix("").parts)
-    docstring = ast.get_docstring(ast.parse(file.read_text())) or ""
-    lines = [f"# {name}", "", as_text(docstring), "", f"File: `src/rol/{place.as_posix()}`", ""]
-    for member, summary in public_members(file):
-        lines += [f"## {member}", "", as_text(summary), "", "````{dropdown} The code", ""]
-        lines += [
-            f"```{{literalinclude}} ../src/rol/{place.as_posix()}",
-            f":pyobject: {member}",
-            ":language: python",
-            "```",
-        ]
-        lines += ["````", ""]
-    return "\n".join(lines)
-
-
-def stage_toolbox(book: Path) -> list[str]:
-    """Write a page for each module and their index; give the names of the pages."""
-    files = [file for file in sorted(PACKAGE.rglob("*.py")) if not file.name.startswith("__")]
-    files.sort(key=lambda file: (len(file.relative_to(PACKAGE).parts), file))
-    shutil.copytree(PACKAGE, book / "src" / "rol", ignore=shutil.ignore_patterns("__pycache__"))
-    (book / "toolbox").mkdir()
-    names, rows = [], []
-    for file in files:
-        name = "-".join(file.relative_to(PACKAGE).with_suffix("").parts)
-        (book / "toolbox" / f"{name}.md").write_text(module_page(file))
-        summary = (ast.get_docstring(ast.parse(file.read_text())) or "").splitlines()[:1]
-        rows.append(f"- [{name.replace('-', '.')}]({name}.md): {as_text(summary[0] if summary else '')}")
-        names.append(name)
-    head = (
-        "# All functions\n\nOne page for each file of `src/rol`, with every public function and its code.\n\n"
-    )
-    (book / "toolbox" / "index.md").write_text(head + "\n".join(rows) + "\n")
-    return names
 
 
 def git(*words: str) -> str:
@@ -286,6 +293,7 @@ def stage(config_path: str) -> Path:
         page.write_text(point_to_pages(page.read_text(), pages))
     contents = expand_contents(yaml.safe_load((book / "_toc.yml").read_text()), pages, modules)
     (book / "_toc.yml").write_text(yaml.safe_dump(contents, sort_keys=False))
+    stage_settings(book, os.environ)
     return book
 
 

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -77,6 +77,9 @@ class RecoverySettings:
         Particles of each.
     workers : int
         Threads of a search.
+    still_m, still_share : float
+        While a step is shorter than this [m], a scan weighs with this share of the exponent: a car that stands sees the
+        same false points again and again, and its scans are one witness rather than many.
     """
 
     level: float
@@ -92,7 +95,7 @@ class RecoverySettings:
     moved_m: float = 0.5
     window: int = 16
     window_m: float = 20.0
-    pause: int = 4
+    pause: int = 2
     trusted_pause: int = 12
     far_pause: int = 20
     max_range_m: float = 40.0
@@ -104,6 +107,8 @@ class RecoverySettings:
     n_far_rivals: int = 100
     rival_particles: int = 50
     workers: int = 1
+    still_m: float = 0.05
+    still_share: float = 0.25
 
 
 @dataclass(frozen=True)
@@ -288,14 +293,15 @@ def localize_with_recovery(
     spreads = settings.start_spread_m, settings.start_spread_yaw_rad
     particles = sample_particles(start, settings.n_particles, *spreads, rng)
     state, steps = _begin(particles, recovery, is_start_known), iter(steps)
+    calm = replace(settings, exponent=recovery.still_share * settings.exponent)
     for index, points in enumerate(clouds):
         step = np.zeros(3) if index == 0 else next(steps, None)
         if step is None:
             raise MclError(f"no odometry step to scan {index}: one fewer than clouds are needed")
-        if index > 0:
-            _move_all(state, step, move, rng)
-        result = update(index, state.particles, state.weights, points, grid, settings, rng)
-        told, winner = _watch(state, result, points, grid, settings, recovery, rng)
+        length = _move_all(state, step, move, rng) if index > 0 else np.inf
+        used = settings if length > recovery.still_m else calm
+        result = update(index, state.particles, state.weights, points, grid, used, rng)
+        told, winner = _watch(state, result, points, grid, used, recovery, rng)
         yield told
         state.particles, state.weights = result.next_particles, result.next_weights
         if winner is not None:
@@ -306,8 +312,8 @@ def localize_with_recovery(
             state.rivals = state.rivals.keep(state.rivals.ages < recovery.trial)
 
 
-def _move_all(state: _State, step: np.ndarray, move: Move, rng: np.random.Generator) -> None:
-    """Move the filter's particles and those of its rivals, and note how far the car went."""
+def _move_all(state: _State, step: np.ndarray, move: Move, rng: np.random.Generator) -> float:
+    """Move the filter's particles and those of its rivals, note how far the car went, and give it [m]."""
     state.particles = move(state.particles, step, rng)
     state.steps.append(move_mean(step, move))
     length = float(np.hypot(*state.steps[-1][:2]))
@@ -315,6 +321,7 @@ def _move_all(state: _State, step: np.ndarray, move: Move, rng: np.random.Genera
     state.well_m += length
     state.searched_m += length
     state.rivals = _move_rivals(state.rivals, step, move, rng)
+    return length
 
 
 def _watch(
@@ -392,16 +399,15 @@ def _weigh_rivals(
     rivals: Rivals, points: np.ndarray, grid: MapGrid, exponent: float, rng: np.random.Generator
 ) -> tuple[Rivals, np.ndarray]:
     """Weigh each rival's particles among themselves, resample where few hold all weight; give their excess, too."""
-    from .mcl import count_matches, resample_systematic
+    from .mcl import count_matches, normalize_weights, resample_systematic, weigh
     from .search import measure_excess
 
     if not len(rivals) or not len(points):
         return rivals, np.zeros(len(rivals))
     h, k, _ = rivals.particles.shape
     sums = count_matches(rivals.particles.reshape(-1, 3), points, grid.values, grid.origin, grid.cell)
-    logs = exponent * np.log(np.maximum(sums.reshape(h, k), 1)) + np.log(np.maximum(rivals.weights, 1e-300))
-    weights = np.exp(logs - logs.max(axis=1, keepdims=True))
-    weights /= weights.sum(axis=1, keepdims=True)
+    logs = weigh(sums.reshape(h, k), exponent)
+    weights = np.array([normalize_weights(*row)[0] for row in zip(logs, rivals.weights, strict=True)])
     weighed = Rivals(rivals.particles.copy(), weights, rivals.scores)
     excess = measure_excess(weighed.poses, points, grid)
     for i in np.flatnonzero(1.0 / np.sum(weights**2, axis=1) < 0.5 * k):
@@ -496,7 +502,7 @@ def _search(
 ) -> None:
     """Search for rivals, if it is time, and follow the new ones beside the best of the old."""
     from .mcl import build_distance_grid
-    from .search import drop_riders, join_clouds, search_poses
+    from .search import drop_riders, join_clouds, search_poses, thin_points
 
     pause = recovery.trusted_pause if state.is_trusted else recovery.pause
     pause = recovery.far_pause if state.is_far else pause
@@ -506,7 +512,7 @@ def _search(
         return
     state.since_search, state.searched_m = 0, 0.0
     clouds, steps = _last_stretch(state, recovery)
-    points = join_clouds(drop_riders(clouds, steps), steps)
+    points = thin_points(join_clouds(drop_riders(clouds, steps), steps), grid.cell)
     n = recovery.n_far_rivals if state.is_far else recovery.n_rivals
     if state.is_far:
         how = {"reach_m": recovery.far_m, "yaw_step": np.deg2rad(2.0), "n_looked_at": 9000, "n_best": n}

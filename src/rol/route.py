@@ -139,9 +139,9 @@ def published_motion() -> MotionModel:
     return MotionModel(
         matrix=((1.015, 0.0, 0.0), (0.0, 0.0, 1.2), (0.0, 0.0, 1.014)),
         still_matrix=((0.27, 0.0, 0.0), (0.0, 0.0, 0.0), (0.0, 0.0, 0.11)),
-        still=(0.023, 0.01, 0.0009),
-        driving=(0.058, 0.02, 0.0035),
-        moving=(0.053, 0.0, 0.0),
+        still=(0.046, 0.01, 0.0017),
+        driving=(0.115, 0.04, 0.0069),
+        moving=(0.107, 0.0, 0.0),
     )
 
 
@@ -278,11 +278,8 @@ def run_rol(
     run : RouteRun
     """
     from .evaluation import FailureRule, FailureWatch
-    from .motion import sample_motion, screen_steps
+    from .motion import mover, screen_steps
     from .recovery import localize_with_recovery
-
-    def move(particles: np.ndarray, step: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-        return sample_motion(particles, step, model, rng)
 
     watch = FailureWatch(route.stamps_us, route.truth, rule or FailureRule())
     filtering = localize_with_recovery(
@@ -292,7 +289,7 @@ def run_rol(
         route.truth[0],
         settings,
         recovery,
-        move,
+        mover(model),
         rng,
         grid=grid,
     )

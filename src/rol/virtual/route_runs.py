@@ -214,7 +214,7 @@ def run_from(
         Their points [m].
     """
     from ..mcl import settings_for
-    from ..motion import sample_motion, screen_steps
+    from ..motion import mover, screen_steps
     from ..recovery import RecoverySettings, localize_with_recovery
     from .map_points import Sight, draw_clouds
 
@@ -224,9 +224,6 @@ def run_from(
     drawing = draw_clouds(stage.map_points, poses, sight, stage.front_end, rng, stage.parts)
     updates, clouds, n_found = [], [], 0
 
-    def move(particles: np.ndarray, step: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-        return sample_motion(particles, step, stage.model, rng)
-
     def keep_clouds() -> Iterator[np.ndarray]:
         for cloud in drawing:
             clouds.append(cloud)
@@ -234,7 +231,7 @@ def run_from(
 
     filtering = localize_with_recovery(
         screen_steps(stage.route.steps[first:]), keep_clouds(), stage.map_points, start, settings_for("rol"),
-        RecoverySettings(stage.level), move, rng, is_start_known=is_start_known, grid=stage.grid,
+        RecoverySettings(stage.level), mover(stage.model), rng, is_start_known=is_start_known, grid=stage.grid,
     )  # fmt: skip
     for update in filtering:
         updates.append(update)

@@ -1,0 +1,154 @@
+"""The staging of the book: its settings where the address of the repository is known, and the pages' own extension."""
+
+import importlib.util
+import sys
+from pathlib import Path
+from types import ModuleType, SimpleNamespace
+
+import pytest
+import yaml
+
+import stage_book
+from chapters import CHAPTERS, NOTEBOOKS, ChapterError
+
+ROOT = Path(__file__).resolve().parents[1]
+KNOWN = {"ROL_REPOSITORY_URL": "https://git.example.org/people/radar.git"}
+
+
+@pytest.fixture
+def book(tmp_path: Path) -> Path:
+    (tmp_path / "_config.yml").write_text((ROOT / "book/_config.yml").read_text())
+    return tmp_path
+
+
+@pytest.fixture(scope="module")
+def quiet_pages() -> ModuleType:
+    spec = importlib.util.spec_from_file_location("quiet_pages", ROOT / "book/_ext/quiet_pages.py")
+    module = importlib.util.module_from_spec(spec)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sys, "dont_write_bytecode", True)  # every file below book/ is an input of the book
+        spec.loader.exec_module(module)
+    return module
+
+
+# ---- settings -------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("environment", [{}, {"ROL_REPOSITORY_URL": ""}, {"ROL_REPOSITORY_BRANCH": "next"}])
+def test_without_an_address_the_settings_stay_as_they_are(book: Path, environment: dict) -> None:
+    before = (book / "_config.yml").read_text()
+    stage_book.stage_settings(book, environment)
+    assert (book / "_config.yml").read_text() == before
+    assert not {"repository", "launch_buttons"} & set(yaml.safe_load(before))
+
+
+def test_with_an_address_the_book_gets_a_button_for_binder(book: Path) -> None:
+    before = yaml.safe_load((book / "_config.yml").read_text())
+    stage_book.stage_settings(book, KNOWN)
+    after = yaml.safe_load((book / "_config.yml").read_text())
+    assert after == before | {
+        "repository": {"url": "https://git.example.org/people/radar", "branch": "main"},
+        "launch_buttons": {"notebook_interface": "jupyterlab", "binderhub_url": "https://mybinder.org"},
+    }
+
+
+def test_branch_and_hub_can_be_named() -> None:
+    more = {"ROL_REPOSITORY_BRANCH": "next", "ROL_BINDERHUB_URL": "https://hub.example.org/"}
+    settings = stage_book.launch_settings(KNOWN | more)
+    assert settings["repository"]["branch"] == "next"
+    assert settings["launch_buttons"]["binderhub_url"] == "https://hub.example.org"
+
+
+@pytest.mark.parametrize(
+    ("name", "address"),
+    [
+        ("ROL_REPOSITORY_URL", "git@git.example.org:people/radar.git"),
+        ("ROL_REPOSITORY_URL", "../radar"),
+        ("ROL_BINDERHUB_URL", "hub.example.org"),
+    ],
+)
+def test_address_that_no_browser_opens_is_refused(name: str, address: str) -> None:
+    with pytest.raises(ChapterError, match=name):
+        stage_book.launch_settings(KNOWN | {name: address})
+
+
+def test_staged_settings_pass_the_check_of_the_book(book: Path) -> None:
+    config = pytest.importorskip("jupyter_book.config")
+    stage_book.stage_settings(book, KNOWN)
+    config.validate_yaml(yaml.safe_load((book / "_config.yml").read_text()), raise_on_errors=True)
+
+
+def test_binder_finds_what_the_button_needs() -> None:
+    environment = yaml.safe_load((ROOT / "environment.yml").read_text())
+    assert any(str(part).startswith("python=3.1") for part in environment["dependencies"])
+    assert {"-r requirements.lock", "-e ."} <= set(environment["dependencies"][-1]["pip"])
+    # With a folder of this name Binder would read that, and not the file.
+    assert not (ROOT / "binder").exists() and not (ROOT / ".binder").exists()
+    assert all((NOTEBOOKS / f"{chapter}.ipynb").is_file() for chapter in CHAPTERS)
+
+
+# ---- the pages' own extension ---------------------------------------------------------------------------------
+
+
+def script(name: str | None, body: str | None = None) -> SimpleNamespace:
+    return SimpleNamespace(filename=name, attributes={"body": body} if body else {})
+
+
+def test_page_keeps_each_script_once_and_none_of_thebe(quiet_pages: ModuleType) -> None:
+    scripts = [
+        script("a.js"),
+        script(None, "const THEBE_JS_URL = 1"),
+        script("sphinx-thebe.js"),
+        script("b.js"),
+    ]
+    context = {
+        "script_files": [*scripts, script("a.js"), script(None, "var a"), script(None, "var a")],
+        "css_files": [SimpleNamespace(filename="sphinx-thebe.css"), SimpleNamespace(filename="book.css")],
+    }
+    quiet_pages.leave_out_scripts(None, "intro", "page.html", context, None)
+    assert [(one.filename, one.attributes.get("body")) for one in context["script_files"]] == [
+        ("a.js", None),
+        ("b.js", None),
+        (None, "var a"),
+    ]
+    assert [sheet.filename for sheet in context["css_files"]] == ["book.css"]
+
+
+@pytest.mark.parametrize(
+    ("page", "notebook"),
+    [
+        ("07_localization-virtual-town-seq02", "07_localization"),
+        ("07_localization-2019-01-10-12-32-52-radar-oxford-10k-paper", "07_localization"),
+        ("03_ground_removal", "03_ground_removal"),
+    ],
+)
+def test_button_opens_the_stored_notebook(quiet_pages: ModuleType, page: str, notebook: str) -> None:
+    start = "https://hub.example.org/v2/gh/people/radar/main?urlpath=lab/tree/notebooks/"
+    button, download = {"url": f"{start}{page}.ipynb"}, {"url": f"../_sources/notebooks/{page}.ipynb"}
+    context = {"header_buttons": [{"type": "group", "buttons": [button]}, download]}
+    quiet_pages.point_to_stored(None, "any", "page.html", context, None)
+    assert button["url"] == f"{start}{notebook}.ipynb"
+    assert download["url"] == f"../_sources/notebooks/{page}.ipynb"
+
+
+def test_finished_pages_are_cleaned(quiet_pages: ModuleType, tmp_path: Path) -> None:
+    (tmp_path / "a.html").write_text(
+        '<head>\n<link rel="preload" as="font" crossorigin href="f.woff2" />\n<link rel="stylesheet" href="a.css">\n'
+        '<script src="_static/vendor/fontawesome/6.5.2/js/all.min.js?digest=1"></script>\n<script src="a.js"></script>'
+        '</head><p><span class="pasted-text">`rol` is better than `paper`</span> `as it stands`</p>'
+    )
+    twice = '<input id="search-input"><input id="search-input">'
+    (tmp_path / "search.html").write_text(twice)
+    app = SimpleNamespace(outdir=tmp_path, builder=SimpleNamespace(format="html"))
+    quiet_pages.clean_pages(app, None)
+    code = '<code class="docutils literal notranslate">{}</code>'
+    assert (tmp_path / "a.html").read_text() == (
+        '<head>\n<link rel="stylesheet" href="a.css">\n<script src="a.js"></script></head><p><span class="pasted-text">'
+        f"{code.format('rol')} is better than {code.format('paper')}</span> `as it stands`</p>"
+    )
+    assert (tmp_path / "search.html").read_text() == (
+        '<input id="search-input"><input id="search-input-of-page">'
+    )
+    (tmp_path / "search.html").write_text(twice)
+    quiet_pages.clean_pages(app, RuntimeError("the build has failed"))
+    assert (tmp_path / "search.html").read_text() == twice
