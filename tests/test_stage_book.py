@@ -1,10 +1,12 @@
 """The staging of the book: its settings where the address of the repository is known, and the pages' own extension."""
 
+import base64
 import importlib.util
 import sys
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 
+import nbformat
 import pytest
 import yaml
 
@@ -152,3 +154,54 @@ def test_finished_pages_are_cleaned(quiet_pages: ModuleType, tmp_path: Path) -> 
     (tmp_path / "search.html").write_text(twice)
     quiet_pages.clean_pages(app, RuntimeError("the build has failed"))
     assert (tmp_path / "search.html").read_text() == twice
+
+
+# ---- links and the first picture ------------------------------------------------------------------------------
+
+
+def test_links_lead_to_pages_and_commands_keep_the_file() -> None:
+    pages = {"07_localization-seq01": SimpleNamespace(chapter="07_localization")}
+    pages |= {
+        chapter: SimpleNamespace(chapter=chapter) for chapter in CHAPTERS if chapter != "07_localization"
+    }
+    told = stage_book.point_to_pages(
+        "[a](notebooks/07_localization.ipynb) [b](07_localization.ipynb#x) {glue:text}`07_localization.ipynb::rmse:.2f`\n"
+        "papermill notebooks/07_localization.ipynb out.ipynb; my_07_localization.ipynb; [c](08_results.ipynb)",
+        pages,
+    )
+    assert told == (
+        "[a](notebooks/07_localization-seq01.ipynb) [b](07_localization-seq01.ipynb#x) "
+        "{glue:text}`07_localization-seq01.ipynb::rmse:.2f`\n"
+        "papermill notebooks/07_localization.ipynb out.ipynb; my_07_localization.ipynb; [c](08_results.ipynb)"
+    )
+
+
+def write_run(path: Path, figure: str, png: bytes | None) -> SimpleNamespace:
+    outputs = (
+        [nbformat.v4.new_output("display_data", {"image/png": base64.b64encode(png).decode()})] if png else []
+    )
+    cell = nbformat.v4.new_code_cell("", outputs=outputs, metadata={"mystnb": {"figure": {"name": figure}}})
+    nbformat.write(nbformat.v4.new_notebook(cells=[cell]), path)
+    return SimpleNamespace(chapter=path.stem, path=lambda out_dir: path)
+
+
+@pytest.mark.parametrize(("real", "words"), [(b"real", "real.md"), (None, "virtual.md")])
+def test_first_picture_is_real_where_it_can_be(
+    book: Path, monkeypatch: pytest.MonkeyPatch, real: bytes | None, words: str
+) -> None:
+    (book / "images").mkdir()
+    for name in ("real.md", "virtual.md"):
+        (book / "images" / name).write_text(name)
+    pngs = {"10_real_radar": real, "07_localization": b"virtual"}
+    runs = {c: write_run(book / f"{c}.ipynb", f, pngs[c]) for c, f, _ in stage_book.RESULT_FIGURES}
+    monkeypatch.setattr(stage_book, "book_pages", lambda config: runs)
+    stage_book.stage_result_figure({"out_dir": ""}, book)
+    assert (book / "images" / "result.png").read_bytes() == (real or b"virtual")
+    assert (book / "picture.md").read_text() == words
+
+
+def test_book_without_a_first_picture_is_refused(book: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    runs = {"07": write_run(book / "07_localization.ipynb", "fig-trajectory", None)}
+    monkeypatch.setattr(stage_book, "book_pages", lambda config: runs)
+    with pytest.raises(ChapterError, match="no PNG figure named fig-trajectory"):
+        stage_book.stage_result_figure({"out_dir": ""}, book)

@@ -23,6 +23,7 @@ import numpy as np
 import pandas as pd
 
 from rol.evaluation import consistency, pose_errors, summarize, write_text
+from rol.mcl import MclSettings, settings_for
 from rol.rall import find_real_root
 from rol.route import Route, RouteRun, list_routes
 from rol.virtual.map_points import FrontEnd
@@ -45,15 +46,26 @@ SETTINGS = {
     "d_th [m]": [("d_th_m", value) for value in (0.25, 0.5, 1.0, 2.0)],
     "noise": [("noise", value) for value in (0.2, 0.5, 1.0, 2.0)],
 }
+INGREDIENTS = {
+    "all of rol": {},
+    "all places of the map alike": {"crowd_m": 0.0},
+    "a hard threshold": {"likelihood": "count", "crowd_m": 0.0},
+    "plain resampling after each scan": {"resampling": "multinomial", "resample_below": 1.0},
+    "lambda of 60": {"exponent": 60.0},
+}
 FRONTS = ((0.40, 0.60), (0.50, 0.70), (0.65, 0.80), (0.80, 0.90))
 
 
 @lru_cache(maxsize=1)
 def stage_of(
-    real_root: str, number: str, shares: tuple[float, float] = (0.40, 0.60), max_scans: int = 0
+    real_root: str,
+    number: str,
+    shares: tuple[float, float] = (0.40, 0.60),
+    max_scans: int = 0,
+    settings: MclSettings | None = None,
 ) -> Stage:
     """Set the stage once per worker and session."""
-    return set_stage(real_root, number, FrontEnd(*shares), max_scans=max_scans)
+    return set_stage(real_root, number, FrontEnd(*shares), max_scans=max_scans, settings=settings)
 
 
 def row_of(stage: Stage, run: RouteRun, method: str, seed: int) -> dict:
@@ -106,6 +118,14 @@ def measure_settings(real_root: str, number: str, seed: int) -> list[dict]:
     return rows
 
 
+def measure_ingredients(real_root: str, number: str, without: str, seed: int) -> list[dict]:
+    """The method `rol` over a whole session with one of its ingredients changed."""
+    changes = INGREDIENTS[without]
+    stage = stage_of(real_root, number, settings=settings_for("rol", **changes))
+    run = run_method(stage, "rol", draw_session(stage, seed), seed, **changes)
+    return [{"without": without, **row_of(stage, run, "rol", seed)}]
+
+
 def measure_fronts(real_root: str, number: str, share_1m: float, share_2m: float, seed: int) -> list[dict]:
     """Both methods with better and better front ends."""
     stage = stage_of(real_root, number, (share_1m, share_2m), SHORT)
@@ -156,6 +176,7 @@ MEASURES = {
     "seeds": measure_seeds,
     "settings": measure_settings,
     "fronts": measure_fronts,
+    "ingredients": measure_ingredients,
     "outliers": measure_outliers,
     "rendered": measure_rendered,
     "kidnapped": measure_trial("kidnapped"),
@@ -182,6 +203,7 @@ def list_jobs(real_root: str) -> dict[str, list[tuple]]:
         "settings": [(first, seed) for seed in (1, 2, 3)],
         "outliers": [(first, share, seed) for share in (0.015, 0.05) for seed in (1, 2, 3)],
         "anywhere": places(50, 120),
+        "ingredients": [(driven[-1], name, seed) for name in INGREDIENTS for seed in (1, 2, 3, 4, 5)],
         "fronts": [(first, *shares, seed) for shares in FRONTS for seed in (1, 2, 3)],
         "rendered": [key for key in (("02", 6000, 400, 1), ("07", 5050, 400, 1)) if key[0] in numbers],
     }

@@ -38,7 +38,10 @@ from toolbox_pages import stage_toolbox
 
 VERSIONS_SHOWN = "numpy scipy opencv-python-headless numba pandas torch open3d-cpu matplotlib papermill snakemake jupyter-book"
 # The picture of the first page is taken from a run: the first of these that there is, and what the page says of it.
-RESULT_FIGURES = (("10_real_radar", "fig-story", "real.md"), ("07_localization", "fig-trajectory", "virtual.md"))
+RESULT_FIGURES = (
+    ("10_real_radar", "fig-story", "real.md"),
+    ("07_localization", "fig-trajectory", "virtual.md"),
+)
 
 
 # ---- notebooks ------------------------------------------------------------------------------------------------

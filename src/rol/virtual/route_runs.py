@@ -17,7 +17,7 @@ import numpy as np
 
 if TYPE_CHECKING:
     from ..evaluation import FailureRule
-    from ..mcl import MapGrid
+    from ..mcl import MapGrid, MclSettings
     from ..motion import MotionModel
     from ..recovery import RecoveryUpdate
     from ..route import RecoveryTrial, Route, RouteRun
@@ -64,7 +64,13 @@ class Stage:
 
 
 def set_stage(
-    real_root: Path | str, number: str, front_end: FrontEnd, *, max_scans: int = 0, n_level: int = 300
+    real_root: Path | str,
+    number: str,
+    front_end: FrontEnd,
+    *,
+    max_scans: int = 0,
+    n_level: int = 300,
+    settings: MclSettings | None = None,
 ) -> Stage:
     """Load a session and the map, look around from all poses, and learn from another session.
 
@@ -80,6 +86,8 @@ def set_stage(
         Use only the first so many scans, 0 for all.
     n_level : int
         Scans of the other session from which the level is learnt.
+    settings : MclSettings, optional
+        Of the filter that the level is for; those of the method `rol` if not given.
 
     Returns
     -------
@@ -104,7 +112,7 @@ def set_stage(
         route = Route(number, route.truth[:max_scans], route.steps[: max_scans - 1])
     model, teacher, poses = learn_from_others(real_root, number, map_points)
     poses = poses[np.linspace(0, len(poses) - 1, min(n_level, len(poses))).astype(int)]
-    grid = build_grid(map_points, settings_for("rol"))
+    grid = build_grid(map_points, settings or settings_for("rol"))
     taught = draw_clouds(
         map_points, poses, look_around(map_points, poses), front_end, np.random.default_rng(0)
     )
