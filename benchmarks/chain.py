@@ -7,7 +7,8 @@ Each scan goes through a front end (raw peaks, or a network and the points of it
 update of the filter `rol` on the map, as they would come from a car: no scan is known before its turn. The scans are
 the real ones in a row, again and again, for as many rounds; without the real data, the first of a virtual session, and
 random streets for a map. Times are medians over the scans, for each part; the rate is that of the parts' sum. What
-poses come out is no matter here. The paper's network at its full width has random weights: they cost the same.
+poses come out is no matter here. The paper's network at its full width has random weights, which cost the same; what it
+draws is of no use, so raw peaks are handed on in its place.
 """
 
 from __future__ import annotations
@@ -62,7 +63,11 @@ def list_front_ends(full_width: int = 64) -> dict[str, FrontEnd]:
         ends[words] = translate(load_translator(weights / f"{name}.safetensors"), headings)
     narrow = load_translator(weights / "paper.safetensors")
     full = ResnetGenerator(full_width, blocks=9).eval()
-    ends["network paper, full width"] = translate(Translator(full, narrow.points, narrow.settings, {}), 1)
+    wide = translate(Translator(full, narrow.points, narrow.settings, {}), 1)
+    ends["network paper, full width"] = lambda codes, azimuths: (
+        wide(codes, azimuths),
+        detect_points(codes, azimuths),
+    )[1]
     return ends
 
 
