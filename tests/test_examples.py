@@ -175,10 +175,10 @@ def runtime_imports(node: ast.AST) -> list[tuple[int, str]]:
 
 def test_mcl_copied_into_an_empty_folder_localizes(tmp_path: Path) -> None:
     blocks = dict(code_blocks(TAKE, "Localize in five lines"))
-    assert "{mcl,geometry}.py" in blocks["bash"] and "pip install numpy numba" in blocks["bash"]
+    assert "{mcl,geometry}.py" in blocks["bash"] and "pip install numpy scipy numba" in blocks["bash"]
     copy_files(["mcl.py", "geometry.py"], tmp_path)
     (tmp_path / "example.py").write_text(blocks["python"])
-    [printed] = run_examples([tmp_path], {"numpy", "numba"})
+    [printed] = run_examples([tmp_path], {"numpy", "scipy", "numba"})
     assert printed == blocks["text"]
     mean, worst, by_odometry = map(float, re.findall(r"(\d+\.\d+) m", printed))
     assert mean < 0.2 and worst < 0.5 < by_odometry
