@@ -54,7 +54,7 @@ def power_to_codes(powers: np.ndarray) -> np.ndarray:
     """Turn integer powers into the sensor's half-dB codes.
 
     The sensor takes its logarithm from the position of the leading one and a straight line through the bits
-    below it: p = round(20 log10(2) * (e + m)) for n = 2**e * (1 + m). On real scans this gives exactly the
+    below it: p = round(20 log10(2) * (e + m)) for n = 2^e (1 + m). On real scans this gives exactly the
     codes that occur.
 
     Parameters

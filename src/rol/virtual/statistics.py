@@ -31,7 +31,7 @@ def forbidden_codes() -> np.ndarray:
     Returns
     -------
     codes : array, shape (11,), uint8
-        1-5, 7, 8, 10, 11, 13, 16: what round(6.0206 (e + m)) skips for n = 2**e (1 + m) = 1, 2, 3, ...
+        1-5, 7, 8, 10, 11, 13, 16: what round(6.0206 (e + m)) skips for n = 2^e (1 + m) = 1, 2, 3, ...
     """
     mantissa, exponent = np.frexp(np.arange(1.0, 64.0))
     reachable = np.round(20.0 * np.log10(2.0) * (exponent + 2.0 * mantissa - 2.0))
