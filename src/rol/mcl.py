@@ -56,8 +56,8 @@ class MclSettings:
         0.45 the pose is lost where the map is dense.
     crowd_m : float
         Of "distance" only: a point counts the less, the fuller the map is within this distance, see
-        `build_distance_grid` [m]; 0 counts all alike. With 2 the session 07 of the real route no longer slips along
-        a street of hedges, where points fit at many places.
+        `build_distance_grid` [m]; 0 counts all alike. With 2 the pose slips far less often
+        along the street of hedges of the real route, where points fit at many places.
     resampling : str
         "multinomial" (plain) or "systematic" (one draw for all).
     resample_below : float
@@ -96,9 +96,9 @@ def settings_for(method: str, **changes: object) -> MclSettings:
     ----------
     method : str
         "paper": matched counts to the power lambda, plain resampling after each scan. "rol": distances
-        instead of a threshold, which count less where the map is full, systematic resampling when the effective sample size falls below one half, as many
-        particles as their spread asks for. Its lambda of 20 was chosen with clouds on the real route: the spread of
-        the particles is then as large as the error (chapter 09).
+        instead of a threshold, which count less where the map is full, systematic resampling when the effective sample
+        size falls below one half, as many particles as their spread asks for. Its lambda of 20 was chosen with clouds on
+        the real route (chapter 09).
     **changes
         Settings that differ from the method's defaults.
 

@@ -68,7 +68,7 @@ def learn_motion(
         Steps that are summed up; over 16 steps, four seconds, errors are independent.
     caution : float
         The noise is taken so many times as large as it was found: another day's odometry errs otherwise, and errors
-        are larger where the car brakes. With 2 the particles' spread on the real route is about as large as the error.
+        are larger where the car brakes. With 2 the spread on the real route is wider than the error (chapter 09).
 
     Returns
     -------
