@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial import cKDTree
 
 from rol import front_ends
-from rol.front_ends import Translator, detect_points, judge_on_map
+from rol.front_ends import Translator, detect_points, even_out, judge_on_map
 
 AZIMUTHS = -2.0 * np.pi * (13 + 14 * np.arange(400)) / 5600
 
@@ -99,3 +99,15 @@ def test_translated_scan_stands_where_the_scan_shows_it(tmp_path: Path) -> None:
     assert 0 < len(fewer) < len(points)
     near = front_ends.translate_scan(copy, scan_with_spot(0.8, 1.5, 255), AZIMUTHS)[0]
     assert len(near) == 0
+
+
+def test_even_out_lets_a_front_count_by_its_length():
+    rng = np.random.default_rng(3)
+    crowd, alone = rng.uniform(0.0, 0.5, (90, 2)), np.arange(10)[:, None] * (5.0, 0.0) + (20.0, 0.0)
+    points = np.concatenate([crowd, alone])
+    drawn = even_out(points, 2.0, rng)
+    assert drawn.shape == points.shape
+    n_crowd = (drawn[:, 0] < 1.0).sum()
+    assert abs(n_crowd - 100 / 11) <= 1.0  # the crowd together counts as one of eleven
+    assert (drawn[:, None] == points[None]).all(axis=-1).any(axis=1).all()
+    assert even_out(np.zeros((0, 2)), 2.0, rng).shape == (0, 2)

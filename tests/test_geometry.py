@@ -146,3 +146,9 @@ def test_flip_y_z_mirrors_y_z_pitch_and_yaw():
         geometry.flip_y_z(T), geometry.transform_from_euler(1, -2, -3, 0.1, -0.2, -0.3), atol=1e-12
     )
     assert_allclose(geometry.flip_y_z(geometry.flip_y_z(T)), T, atol=1e-12)
+
+
+def test_first_of_cells_by_hand():
+    points = np.array([[0.1, 0.1], [-0.1, 0.1], [0.2, 0.05], [5.0, 5.0], [0.1, 0.1], [5.1, 5.2]])
+    np.testing.assert_array_equal(geometry.first_of_cells(points, 0.25), points[[0, 1, 3]])
+    assert geometry.first_of_cells(np.zeros((0, 2)), 0.25).shape == (0, 2)

@@ -358,6 +358,27 @@ def test_supervisor_restarts_the_particles():
     np.testing.assert_allclose(poses[:, 0], (30.0, 30.0, 10.0), atol=0.4)
 
 
+def test_many_particles_at_the_first_scan_and_few_later():
+    settings = mcl.MclSettings(n_particles=50, resampling="systematic")
+    first, second = mcl.localize(
+        [(0.0, 0.0, 0.0)], [CLOUD] * 2, mcl.build_grid(CLOUD, settings), (0.0, 0.0, 0.0), settings,
+        np.random.default_rng(9), n_first=4000,
+    )  # fmt: skip
+    assert len(first.particles) == 4000 and len(second.particles) == 50
+    kept = np.mean(first.next_particles[:, :2], axis=0)
+    np.testing.assert_allclose(np.mean(second.particles[:, :2], axis=0), kept, atol=0.35)
+
+
+def test_those_who_stay_stand_for_all():
+    particles, weights = np.zeros((1000, 3)), np.zeros(1000)
+    particles[:, 0] = np.arange(1000)
+    weights[100:300] = 1.0 / 200
+    few, equal = mcl._keep_some(particles, weights, 20, np.random.default_rng(0))
+    np.testing.assert_allclose(few[:, 0], np.arange(100, 300, 10), atol=2.0)
+    np.testing.assert_array_equal(equal, np.full(20, 0.05))
+    assert len(mcl._keep_some(particles[:5], np.full(5, 0.2), 20, np.random.default_rng(0))[0]) == 5
+
+
 def test_localize_is_online():
     # each estimate is there before the next cloud or step is asked for
     given = []

@@ -4,10 +4,11 @@ import base64
 import json
 import re
 
+import cv2
 import numpy as np
 import pytest
 
-from rol.player import CLOUD_STEP, MAP_STEP, PARTICLE_STEP, Frame, play_filter
+from rol.player import CLOUD_STEP, MAP_STEP, PARTICLE_STEP, Frame, play_filter, play_images
 
 MAP = np.array([[0.0, 0.0], [12.3, -4.5], [500.0, 0.0]])
 
@@ -58,3 +59,62 @@ def test_nothing_to_play_is_an_error():
         play_filter(MAP, [], "words")
     with pytest.raises(ValueError, match="not finite"):
         play_filter(MAP, [Frame(MAP * np.nan, np.zeros((1, 3)), np.zeros(3), np.zeros(3), "")], "words")
+
+
+# ---- images ---------------------------------------------------------------------------------------------------
+
+GREY = np.tile(np.linspace(0, 255, 64).astype(np.uint8), (64, 1))
+MASK = np.zeros((64, 64), np.uint8)
+MASK[10:20, 30:50] = 255
+PANELS = {"radar": [GREY, GREY.T], "fake": [MASK, MASK.T]}
+
+
+def image_of(address: str) -> np.ndarray:
+    """Decode an image that an address holds, as red, green, blue."""
+    data = np.frombuffer(base64.b64decode(address.partition(",")[2]), dtype=np.uint8)
+    return cv2.imdecode(data, cv2.IMREAD_COLOR)[..., ::-1]
+
+
+def play(panels: dict = PANELS, texts: tuple = ("0 s", "1 s"), **changes: object) -> str:
+    settings = {"colours": {"fake": "#009E73"}, "metres_across": 80.0, "size": 64, "quality": 95} | changes
+    return play_images(panels, texts, "words", **settings)
+
+
+def test_images_are_kept_grey_or_in_their_colour():
+    first, second = unpack(play())["frames"]
+    assert first[0].startswith("data:image/jpeg") and first[1].startswith("data:image/png")
+    np.testing.assert_allclose(image_of(first[0])[..., 0], 255 - GREY, atol=6)
+    np.testing.assert_allclose(image_of(second[0])[..., 0], 255 - GREY.T, atol=6)
+    painted = np.where(MASK[..., None] > 0, (0x00, 0x9E, 0x73), 255)
+    np.testing.assert_array_equal(image_of(first[1]), painted)
+    assert first[2] == "0 s" and second[2] == "1 s"
+
+
+def test_small_panels_lose_no_point():
+    dots = np.zeros((64, 64), np.uint8)
+    dots[::16, ::16] = 1
+    (shown,) = unpack(play({"fake": [dots]}, ("now",), size=16))["frames"]
+    assert image_of(shown[0]).shape == (16, 16, 3)
+    assert (image_of(shown[0])[..., 0] < 255).sum() == 16
+
+
+def test_page_of_images_is_safe_the_same_each_time_and_fetches_nothing():
+    page = play(texts=("</script>", "1 s"))
+    assert page == play(texts=("</script>", "1 s")) and page.count("</script>") == 1
+    assert "http" not in page and "src=" not in page
+    assert unpack(page)["titles"] == ["radar", "fake"]
+
+
+@pytest.mark.parametrize(
+    ("panels", "texts", "words"),
+    [
+        ({}, ("now",), "no image"),
+        (PANELS, (), "no image"),
+        (PANELS, ("now",), "radar: 2 images, but 1 texts"),
+        ({"radar": [GREY.astype(float)]}, ("now",), "uint8"),
+        ({"radar": [GREY[..., None]]}, ("now",), r"\(h, w\)"),
+    ],
+)
+def test_images_that_cannot_be_played_are_refused(panels: dict, texts: tuple, words: str):
+    with pytest.raises(ValueError, match=words):
+        play(panels, texts)

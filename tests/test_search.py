@@ -7,7 +7,7 @@ import pytest
 
 from rol.geometry import compose, invert, transform_points
 from rol.mcl import build_distance_grid
-from rol.search import Lattice, drop_riders, join_clouds, measure_excess, search_poses, thin_points
+from rol.search import Lattice, drop_riders, join_clouds, measure_excess, search_poses
 
 
 def town(rng: np.random.Generator) -> np.ndarray:
@@ -101,9 +101,3 @@ def test_nothing_is_found_from_nothing() -> None:
     assert poses.shape == (0, 3) and excess.shape == (0,)
     with pytest.raises(ValueError, match="centre of the search"):
         search_poses(np.zeros((1, 2)), grid, grid, np.array([0.0, np.nan, 0.0]), 10.0)
-
-
-def test_what_was_seen_again_and_again_counts_once() -> None:
-    cloud = np.array([[0.1, 0.1], [-0.1, 0.1], [0.2, 0.05], [5.0, 5.0], [0.1, 0.1], [5.1, 5.2]])
-    np.testing.assert_array_equal(thin_points(cloud, 0.25), cloud[[0, 1, 3]])
-    assert thin_points(np.zeros((0, 2)), 0.25).shape == (0, 2)

@@ -205,3 +205,58 @@ def test_book_without_a_first_picture_is_refused(book: Path, monkeypatch: pytest
     monkeypatch.setattr(stage_book, "book_pages", lambda config: runs)
     with pytest.raises(ChapterError, match="no PNG figure named fig-trajectory"):
         stage_book.stage_result_figure({"out_dir": ""}, book)
+
+
+# ---- what opens a chapter -------------------------------------------------------------------------------------
+
+
+def chapter_with(*figures: tuple[str, bytes | None, str | None]) -> nbformat.NotebookNode:
+    """A chapter with figures: name, picture, and the sentence that lets it open the chapter."""
+    cells = [
+        nbformat.v4.new_markdown_cell("# Title\n\nPurpose."),
+        nbformat.v4.new_code_cell("a = 1", metadata={"tags": ["parameters"]}),
+        nbformat.v4.new_code_cell("a = 2", metadata={"tags": ["injected-parameters"]}),
+    ]
+    for name, png, opening in figures:
+        metadata = {"mystnb": {"figure": {"name": name}, "image": {"alt": f"Alt of {name}"}}}
+        metadata |= {"opening": opening} if opening else {}
+        data = {"image/png": base64.b64encode(png).decode()} if png else {"text/plain": "nothing"}
+        output = nbformat.v4.new_output("display_data", data)
+        cells.append(nbformat.v4.new_code_cell("", outputs=[output], metadata=metadata))
+    return nbformat.v4.new_notebook(cells=cells)
+
+
+def test_chapter_opens_with_the_first_picture_that_was_drawn(tmp_path: Path) -> None:
+    notebook = chapter_with(
+        ("fig-a", b"a", None), ("fig-b", None, "B"), ("fig-c", b"c", "C ({kind} data)"), ("fig-d", b"d", "D")
+    )
+    stage_book.open_with_picture(notebook, tmp_path / "images", "05_chapter", "Virtual")
+    assert (tmp_path / "images/opening-05_chapter.png").read_bytes() == b"c"
+    lines = notebook.cells[0].source.split("\n")
+    assert lines[:3] == ["# Title", "", "Purpose."] and ":alt: Alt of fig-c" in lines
+    assert "```{image} ../images/opening-05_chapter.png" in lines
+    assert "C (virtual data) ({numref}`fig-c`)." in lines
+
+
+def test_chapter_without_a_drawn_picture_opens_without_one(tmp_path: Path) -> None:
+    notebook = chapter_with(("fig-a", b"a", None), ("fig-b", None, "B"))
+    stage_book.open_with_picture(notebook, tmp_path / "images", "09_chapter", "Real")
+    assert notebook.cells[0].source == "# Title\n\nPurpose." and not (tmp_path / "images").exists()
+
+
+def test_parameters_lie_behind_lines_that_name_them() -> None:
+    notebook = chapter_with()
+    stage_book.fold_parameters(notebook)
+    for cell, words in zip(notebook.cells[1:], ("parameters", "parameters of this run"), strict=True):
+        assert "hide-input" in cell.metadata["tags"]
+        assert cell.metadata["mystnb"]["code_prompt_show"] == f"Show the {words}"
+
+
+def test_every_chapter_has_a_figure_that_opens_it() -> None:
+    for chapter in CHAPTERS:
+        cells = nbformat.read(NOTEBOOKS / f"{chapter}.ipynb", as_version=4).cells
+        opening = [cell.metadata for cell in cells if "opening" in cell.metadata]
+        assert opening, chapter
+        for metadata in opening:
+            assert metadata["mystnb"]["figure"]["name"] and metadata["mystnb"]["image"]["alt"]
+            assert not metadata["opening"].rstrip().endswith(".")  # the reference to the figure follows

@@ -47,11 +47,37 @@ RESULT_FIGURES = (
 # ---- notebooks ------------------------------------------------------------------------------------------------
 
 
-def fold_injected(notebook: nbformat.NotebookNode) -> None:
-    """Hide the cell of parameters that papermill put in behind a line that says what it is (in place)."""
-    for cell in tagged_cells(notebook, "injected-parameters"):
-        cell.metadata["tags"] = ["injected-parameters", "hide-input"]
-        cell.metadata["mystnb"] = {"code_prompt_show": "Show the parameters of this run"}
+def fold_parameters(notebook: nbformat.NotebookNode) -> None:
+    """Hide the parameters, and those that papermill put in, behind lines that say what they are (in place)."""
+    for tag, words in (("parameters", "parameters"), ("injected-parameters", "parameters of this run")):
+        for cell in tagged_cells(notebook, tag):
+            cell.metadata["tags"] = [tag, "hide-input"]
+            cell.metadata["mystnb"] = {
+                "code_prompt_show": f"Show the {words}",
+                "code_prompt_hide": f"Hide the {words}",
+            }
+
+
+def open_with_picture(notebook: nbformat.NotebookNode, images: Path, page: str, kind: str) -> None:
+    """Put a picture of the chapter below its first words, with one sentence on what it shows (in place).
+
+    It is the first figure that has a sentence in its cell's metadata (`opening`) and that the run drew; without the
+    real data some chapters have none.
+    """
+    for cell in notebook.cells:
+        png = png_of(cell) if "opening" in cell.metadata else None
+        if png is None:
+            continue
+        images.mkdir(exist_ok=True)
+        (images / f"opening-{page}.png").write_bytes(png)
+        words = cell.metadata["opening"].replace("{kind}", kind.lower())
+        label, alt = cell.metadata["mystnb"]["figure"]["name"], cell.metadata["mystnb"]["image"]["alt"]
+        first = next(cell for cell in notebook.cells if cell.cell_type == "markdown")
+        first.source += (
+            f"\n\n```{{image}} ../images/opening-{page}.png\n:alt: {alt}\n:class: opening\n```\n\n"
+            f"```{{container}} opening\n{words} ({{numref}}`{label}`).\n```"
+        )
+        return
 
 
 def number_title(notebook: nbformat.NotebookNode, page: str) -> None:
@@ -130,8 +156,9 @@ def stage_notebooks(config: dict, book: Path) -> None:
     (book / "notebooks").mkdir()
     for page, run in pages.items():
         notebook = load_run(run.path(config["out_dir"]), NOTEBOOKS / f"{run.chapter}.ipynb")
-        fold_injected(notebook)
+        fold_parameters(notebook)
         complete_captions(notebook, kind)
+        open_with_picture(notebook, book / "images", page, kind)
         number_title(notebook, page)
         if run.chapter in seen:
             relabel(notebook, re.sub(r"\W+", "-", page.removeprefix(run.chapter)))
@@ -142,13 +169,19 @@ def stage_notebooks(config: dict, book: Path) -> None:
         nbformat.write(notebook, book / "notebooks" / f"{page}.ipynb")
 
 
+def png_of(cell: nbformat.NotebookNode) -> bytes | None:
+    """Take the PNG out of the outputs of a cell; none where the run drew none."""
+    for output in cell.outputs:
+        if "image/png" in output.get("data", {}):
+            return base64.b64decode(output.data["image/png"])
+    return None
+
+
 def read_figure(notebook: Path, name: str) -> bytes | None:
     """Take the PNG of a named figure out of an executed notebook; none where the run drew none."""
     for cell in nbformat.read(notebook, as_version=4).cells:
         if cell.metadata.get("mystnb", {}).get("figure", {}).get("name") == name:
-            for output in cell.outputs:
-                if "image/png" in output.get("data", {}):
-                    return base64.b64decode(output.data["image/png"])
+            return png_of(cell)
     return None
 
 

@@ -187,6 +187,33 @@ def detect_points(
     )  # fmt: skip
 
 
+def even_out(points: np.ndarray, radius_m: float, rng: np.random.Generator) -> np.ndarray:
+    """Draw as many points again, each the less often the more others lie near it: a front counts by its length then.
+
+    Parameters
+    ----------
+    points : array, shape (n, 2)
+        Cloud [m].
+    radius_m : float
+        Points nearer to one another than this share their weight [m].
+    rng : numpy.random.Generator
+        Source of randomness.
+
+    Returns
+    -------
+    points : array, shape (n, 2)
+        Points of the cloud, some of them several times.
+    """
+    from scipy.spatial import cKDTree
+
+    from .mcl import resample_systematic
+
+    if len(points) == 0:
+        return points
+    crowd = cKDTree(points).query_ball_point(points, radius_m, return_length=True)
+    return points[resample_systematic(1.0 / crowd, rng)]
+
+
 def judge_on_map(points: np.ndarray, T_map_radar: np.ndarray, map_tree: cKDTree) -> dict[str, float | int]:
     """Say how near the points of a scan lie to a lidar map, at the scan's pose.
 

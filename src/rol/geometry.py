@@ -157,6 +157,25 @@ def transform_points(T_a_b: np.ndarray, points: np.ndarray) -> np.ndarray:
     return np.asarray(points, dtype=np.float64) @ np.array([[c, s], [-s, c]]) + (x, y)
 
 
+def first_of_cells(points: np.ndarray, cell: float) -> np.ndarray:
+    """Keep one point of each square cell: what was seen again and again from one place counts once.
+
+    Parameters
+    ----------
+    points : array, shape (n, 2)
+        Points [m].
+    cell : float
+        Side of a cell [m].
+
+    Returns
+    -------
+    points : array, shape (k, 2)
+        The first of each cell, in the order given.
+    """
+    cells = np.floor(np.asarray(points, dtype=np.float64) / cell).astype(np.int64)
+    return points[np.sort(np.unique(cells, axis=0, return_index=True)[1])]
+
+
 def interpolate_poses(stamps_us: np.ndarray, poses: np.ndarray, query_us: np.ndarray) -> np.ndarray:
     """Interpolate poses linearly in time, headings the short way round.
 

@@ -73,8 +73,9 @@ def remove_ground(points: np.ndarray, min_height: float = -1.5, max_height: floa
     points : array, shape (m, 3) or more columns
         The points kept, in their order; points whose z is not a number are dropped.
 
-    Notes ----- Yin et al. 2020, Sec. III-A: "a height threshold on original 3D lidar point cloud". The paper
-    gives no number.
+    Notes
+    -----
+    Yin et al. 2020, Sec. III-A: "a height threshold on original 3D lidar point cloud". The paper gives no number.
     """
     points = _check_points(points)
     if min_height > max_height:

@@ -724,6 +724,7 @@ def localize(
     rng: np.random.Generator,
     supervisor: Callable[[int, np.ndarray], np.ndarray | None] | None = None,
     move: Callable[[np.ndarray, np.ndarray, np.random.Generator], np.ndarray] | None = None,
+    n_first: int | None = None,
 ) -> Iterator[MclUpdate]:
     """Run the filter scan by scan; a generator, so it can follow a live sensor.
 
@@ -746,6 +747,8 @@ def localize(
         as the authors did by hand.
     move : callable, optional
         Moves particles by a step, such as `rol.motion.sample_motion` with a learnt model; `predict` if not given.
+    n_first : int, optional
+        Particles at the first scan, where the start is known badly; ``settings.n_particles`` if not given.
 
     Yields
     ------
@@ -753,8 +756,8 @@ def localize(
         One per scan. Yin et al. 2020, Sec. III-B.
     """
     spreads = settings.start_spread_m, settings.start_spread_yaw_rad
-    particles = sample_particles(start, settings.n_particles, *spreads, rng)
-    weights = np.full(settings.n_particles, 1.0 / settings.n_particles)
+    n = n_first or settings.n_particles
+    particles, weights = sample_particles(start, n, *spreads, rng), np.full(n, 1.0 / n)
     steps = iter(steps)
     for index, points in enumerate(clouds):
         if index > 0:
@@ -765,10 +768,24 @@ def localize(
         result = update(index, particles, weights, points, grid, settings, rng)
         yield result
         particles, weights = result.next_particles, result.next_weights
+        if index == 0 and n > settings.n_particles:
+            particles, weights = _keep_some(particles, weights, settings.n_particles, rng)
         restart = supervisor(index, result.pose) if supervisor else None
         if restart is not None:
             particles = sample_particles(restart, settings.n_particles, *spreads, rng)
             weights = np.full(settings.n_particles, 1.0 / settings.n_particles)
+
+
+def _keep_some(
+    particles: np.ndarray, weights: np.ndarray, n: int, rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray]:
+    """Let n of the particles stand for all, by their weights; all the same if there are no more than n."""
+    n = min(n, len(particles))
+    drawn = np.sort(
+        resample_systematic(weights, rng)
+    )  # sorted, so that every so many-th stands for its neighbours
+    chosen = drawn[np.linspace(0, len(drawn), n, endpoint=False, dtype=int)]
+    return particles[chosen], np.full(n, 1.0 / n)
 
 
 def _pick(weights: np.ndarray, draws: np.ndarray) -> np.ndarray:

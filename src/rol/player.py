@@ -1,9 +1,8 @@
-"""The projection room: an animation of the filter for a page, drawn by the browser from a few hundred
-kilobytes.
+"""The projection room: animations for a page, drawn by the browser from a few hundred kilobytes.
 
-A film of thousands of moving dots is large and blurred; the dots themselves are small and sharp. So the page
-gets the coordinates and a short script that draws them, with a button, a slider, and nothing loaded from
-elsewhere.
+A film of thousands of moving dots is large and blurred; the dots themselves are small and sharp. So for the filter the
+page gets the coordinates and a short script that draws them, and for images it gets small pictures, with a button, a
+slider, and nothing loaded from elsewhere.
 """
 
 from __future__ import annotations
@@ -12,11 +11,16 @@ import base64
 import hashlib
 import html
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from string import Template
 
 import numpy as np
+
+try:
+    from .geometry import first_of_cells
+except ImportError:  # this file was copied on its own
+    from geometry import first_of_cells
 
 COLOURS = {
     "map": "#8C8C8C",
@@ -111,27 +115,113 @@ def play_filter(
         "pause": 1000.0 / frames_per_second,
         "colours": {**COLOURS, "cloud": cloud_colour},
         "origin": np.round(origin, 3).tolist(),
-        "map": _pack(_thin_cells(near - origin, 0.4), MAP_STEP, np.int16),
+        "map": _pack(first_of_cells(near - origin, 0.4), MAP_STEP, np.int16),
         "frames": [
             [cloud, swarm, np.round(f.estimate, 3).tolist(), np.round(f.truth, 3).tolist(), f.text]
             for cloud, swarm, f in zip(clouds, swarms, frames, strict=True)
         ],
     }
+    return _page(data, words, size, size, _DRAW_FILTER)
+
+
+def play_images(
+    panels: Mapping[str, Sequence[np.ndarray]],
+    texts: Sequence[str],
+    words: str,
+    *,
+    colours: Mapping[str, str],
+    metres_across: float,
+    size: int = 320,
+    frames_per_second: float = 4.0,
+    quality: int = 40,
+) -> str:
+    """Build an animation of images side by side as a piece of HTML, the car in the middle of each, driving up.
+
+    Parameters
+    ----------
+    panels : mapping of str to sequence of array, shape (h, h), uint8
+        The images of each panel in the order of time, by its title.
+    texts : sequence of str
+        Words beside the slider, for each time.
+    words : str
+        What is to be seen, for those who cannot see it.
+    colours : mapping of str to str
+        Panels that are drawn in one colour, "#RRGGBB", wherever they are not 0; the others are grey, dark on white.
+    metres_across : float
+        Edge of what an image shows [m].
+    size : int
+        Edge of a panel [pixels]; images are stored no larger.
+    frames_per_second : float
+        Speed.
+    quality : int
+        Of the grey images, 1 to 100; they are kept as JPEG, the others without loss.
+
+    Returns
+    -------
+    html : str
+        For `IPython.display.HTML`.
+
+    Raises
+    ------
+    ValueError
+        If there is no image, a panel has another number of them than there are texts, or an image is not of grey values.
+    """
+    if not texts or not panels:
+        raise ValueError("no image to play")
+    for title, images in panels.items():
+        if len(images) != len(texts):
+            raise ValueError(f"{title}: {len(images)} images, but {len(texts)} texts")
+    rows = [
+        [_encode(image, colours.get(title), size, quality) for image in images]
+        for title, images in panels.items()
+    ]
+    data = {
+        "pause": 1000.0 / frames_per_second,
+        "size": size,
+        "across": metres_across,
+        "titles": list(panels),
+        "frames": [[*images, text] for *images, text in zip(*rows, texts, strict=True)],
+    }
+    gap, head = 12, 34
+    width = len(panels) * (size + gap) - gap
+    return _page({**data, "gap": gap, "head": head}, words, width, size + head, _DRAW_IMAGES)
+
+
+def _encode(image: np.ndarray, colour: str | None, size: int, quality: int) -> str:
+    """Write an image as an address that holds it: JPEG of its greys, dark on white, or PNG in one colour."""
+    import cv2
+
+    image = np.asarray(image)
+    if image.ndim != 2 or image.dtype != np.uint8:
+        raise ValueError(
+            f"an image of grey values must have shape (h, w) and type uint8, not {image.shape}, {image.dtype}"
+        )
+    scale = min(size / max(image.shape), 1.0)
+    if colour is None:
+        small = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+        kind, coded = "jpeg", cv2.imencode(".jpg", 255 - small, [cv2.IMWRITE_JPEG_QUALITY, quality])[1]
+    else:
+        full = (image > 0).astype(np.float32)
+        full = cv2.resize(full, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA) > 0.0
+        blue_green_red = [int(colour[k : k + 2], 16) for k in (5, 3, 1)]
+        painted = np.where(full[..., None], blue_green_red, 255).astype(np.uint8)
+        kind, coded = "png", cv2.imencode(".png", painted, [cv2.IMWRITE_PNG_COMPRESSION, 9])[1]
+    return f"data:image/{kind};base64,{base64.b64encode(coded.tobytes()).decode()}"
+
+
+def _page(data: dict, words: str, width: int, height: int, draw: str) -> str:
+    """Put data and the script that draws them together with button and slider."""
     text = json.dumps(data, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
-    name = "player-" + hashlib.sha256(text.encode()).hexdigest()[:10]
-    return _PAGE.substitute(name=name, words=html.escape(words), size=size, last=len(frames) - 1, data=text)
+    return _PAGE.substitute(
+        name="player-" + hashlib.sha256(text.encode()).hexdigest()[:10],
+        words=html.escape(words), width=width, height=height, last=len(data["frames"]) - 1, data=text, draw=draw,
+    )  # fmt: skip
 
 
 def _thin(points: np.ndarray, most: int) -> np.ndarray:
     """Keep at most so many points, evenly chosen."""
     points = np.asarray(points, dtype=np.float64)
     return points if len(points) <= most else points[np.linspace(0, len(points) - 1, most).astype(int)]
-
-
-def _thin_cells(points: np.ndarray, cell: float) -> np.ndarray:
-    """Keep the first point of each cell."""
-    _, first = np.unique(np.floor(points / cell), axis=0, return_index=True)
-    return points[np.sort(first)]
 
 
 def _pack(points: np.ndarray, step: float, kind: type) -> str:
@@ -143,8 +233,8 @@ def _pack(points: np.ndarray, step: float, kind: type) -> str:
     return base64.b64encode(steps.astype(kind).tobytes()).decode()
 
 
-_PAGE = Template("""<div id="$name" style="max-width: ${size}px">
-<canvas width="$size" height="$size" role="img" aria-label="$words" style="width: 100%"></canvas>
+_PAGE = Template("""<div id="$name" style="max-width: ${width}px">
+<canvas width="$width" height="$height" role="img" aria-label="$words" style="width: 100%"></canvas>
 <div style="display: flex; gap: 0.6em; align-items: center">
 <button type="button" aria-label="play or pause" style="width: 3em">&#9654;</button>
 <input type="range" min="0" max="$last" value="0" aria-label="time" style="flex: 1">
@@ -157,7 +247,21 @@ const box = document.getElementById("$name");
 const canvas = box.querySelector("canvas"), pen = canvas.getContext("2d");
 const button = box.querySelector("button"), slider = box.querySelector("input");
 const note = box.querySelector("span");
-const bytes = (text) => Uint8Array.from(atob(text), (c) => c.charCodeAt(0));
+$draw
+let timer = null;
+const stop = () => { clearInterval(timer); timer = null; button.innerHTML = "&#9654;"; };
+const step = () => { slider.value = +slider.value < +slider.max ? +slider.value + 1 : 0; draw(); };
+button.onclick = () => {
+  if (timer) { stop(); return; }
+  timer = setInterval(step, data.pause); button.innerHTML = "&#10074;&#10074;";
+};
+slider.oninput = () => { stop(); draw(); };
+draw();
+})();
+</script>
+</div>""")
+
+_DRAW_FILTER = """const bytes = (text) => Uint8Array.from(atob(text), (c) => c.charCodeAt(0));
 const land = new Int16Array(bytes(data.map).buffer), scale = canvas.width / (2 * data.half);
 const mid = canvas.width / 2;
 const dots = (values, step, shift, colour, edge) => {
@@ -184,16 +288,36 @@ const draw = () => {
   dots(new Int8Array(bytes(swarm).buffer), data.steps[2], [0, 0], c.particles, 3);
   arrow(truth, eye, c.truth); arrow(eye, eye, c.estimate);
   note.textContent = text;
+};"""
+
+_DRAW_IMAGES = """const load = (address) => {
+  const image = new Image(); image.onload = () => draw(); image.src = address; return image;
 };
-let timer = null;
-const stop = () => { clearInterval(timer); timer = null; button.innerHTML = "&#9654;"; };
-const step = () => { slider.value = +slider.value < +slider.max ? +slider.value + 1 : 0; draw(); };
-button.onclick = () => {
-  if (timer) { stop(); return; }
-  timer = setInterval(step, data.pause); button.innerHTML = "&#10074;&#10074;";
+const ink = "#222222", metre = data.size / data.across;
+const bar = [5, 10, 20, 50].find((length) => length * metre > 50) || 100;
+const frame = (k) => {
+  const left = k * (data.size + data.gap), mid = left + data.size / 2;
+  pen.fillStyle = ink; pen.fillText(data.titles[k], left + 2, 23);
+  pen.strokeStyle = ink; pen.lineWidth = 1; pen.strokeRect(left + 0.5, data.head + 0.5, data.size - 1, data.size - 1);
+  pen.lineWidth = 3; pen.lineCap = "round"; pen.beginPath();
+  for (const [u, v] of [[0, 9], [0, -9], [-6, -2], [0, -9], [6, -2]]) pen.lineTo(mid + u, data.head + data.size / 2 + v);
+  pen.stroke();
 };
-slider.oninput = () => { stop(); draw(); };
-draw();
-})();
-</script>
-</div>""")
+const rule = () => {
+  const low = canvas.height - 12;
+  pen.fillStyle = "#FFFFFF"; pen.fillRect(6, low - 24, bar * metre + 64, 30);
+  pen.fillStyle = ink; pen.fillRect(12, low - 6, bar * metre, 3);
+  pen.fillText(bar + " m", 18 + bar * metre, low + 1);
+};
+const draw = () => {
+  const images = shown[slider.value];
+  pen.fillStyle = "#FFFFFF"; pen.fillRect(0, 0, canvas.width, canvas.height);
+  pen.font = "22px sans-serif"; pen.imageSmoothingEnabled = false;
+  images.forEach((image, k) => {
+    if (image.complete) pen.drawImage(image, k * (data.size + data.gap), data.head, data.size, data.size);
+    frame(k);
+  });
+  rule(); note.textContent = data.frames[slider.value][data.titles.length];
+};
+const shown = [];
+data.frames.forEach((row) => shown.push(row.slice(0, -1).map(load)));"""

@@ -21,9 +21,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 try:
-    from .geometry import check_poses, wrap_angle
+    from .geometry import check_poses, first_of_cells, wrap_angle
 except ImportError:  # this file was copied on its own
-    from geometry import check_poses, wrap_angle
+    from geometry import check_poses, first_of_cells, wrap_angle
 
 if TYPE_CHECKING:
     from .mcl import MapGrid, MclSettings, MclUpdate
@@ -502,7 +502,7 @@ def _search(
 ) -> None:
     """Search for rivals, if it is time, and follow the new ones beside the best of the old."""
     from .mcl import build_distance_grid
-    from .search import drop_riders, join_clouds, search_poses, thin_points
+    from .search import drop_riders, join_clouds, search_poses
 
     pause = recovery.trusted_pause if state.is_trusted else recovery.pause
     pause = recovery.far_pause if state.is_far else pause
@@ -512,7 +512,7 @@ def _search(
         return
     state.since_search, state.searched_m = 0, 0.0
     clouds, steps = _last_stretch(state, recovery)
-    points = thin_points(join_clouds(drop_riders(clouds, steps), steps), grid.cell)
+    points = first_of_cells(join_clouds(drop_riders(clouds, steps), steps), grid.cell)
     n = recovery.n_far_rivals if state.is_far else recovery.n_rivals
     if state.is_far:
         how = {"reach_m": recovery.far_m, "yaw_step": np.deg2rad(2.0), "n_looked_at": 9000, "n_best": n}

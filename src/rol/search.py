@@ -89,25 +89,6 @@ def drop_riders(
     return kept
 
 
-def thin_points(points: np.ndarray, cell: float) -> np.ndarray:
-    """Keep one point of each cell: what was seen again and again from one place counts once.
-
-    Parameters
-    ----------
-    points : array, shape (m, 2)
-        Cloud [m].
-    cell : float
-        Side of a cell [m].
-
-    Returns
-    -------
-    points : array, shape (k, 2)
-        The first of each cell, in the order given.
-    """
-    cells = np.floor(np.asarray(points, dtype=np.float64) / cell).astype(np.int64)
-    return points[np.sort(np.unique(cells, axis=0, return_index=True)[1])]
-
-
 def measure_excess(poses: np.ndarray, points: np.ndarray, grid: MapGrid) -> np.ndarray:
     """Measure how much better a cloud fits at poses than it does there in other headings.
 

@@ -69,7 +69,8 @@ class Visit:
     """What a page was found to be: its address, the view, faults as (rule, what), and what it holds.
 
     ``links`` are pairs of the address and what the page says for it, ``anchors`` the names that can be linked to, and
-    ``counts`` the numbers of equations, images and canvases; ``theme`` is "light" or "dark".
+    ``counts`` the numbers of equations, images and canvases; ``theme`` is "light" or "dark"; ``picture`` is how far down
+    the first picture ends [px].
     """
 
     address: str
@@ -79,6 +80,7 @@ class Visit:
     anchors: set[str]
     theme: str
     counts: dict[str, int]
+    picture: int | None
 
 
 def find_chromium() -> str | None:
@@ -270,7 +272,9 @@ class Tab:
         seen = self.run(f"({CHECKS})()")
         faults = [*heard_faults(self.events), *((rule, what) for rule, what in seen["faults"])]
         links = [(whole, said) for whole, said in seen["links"]]
-        return Visit(address, view, faults, links, set(seen["anchors"]), seen["theme"], seen["counts"])
+        return Visit(
+            address, view, faults, links, set(seen["anchors"]), seen["theme"], seen["counts"], seen["picture"]
+        )
 
 
 def heard_faults(events: list[dict]) -> list[tuple[str, str]]:

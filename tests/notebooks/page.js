@@ -167,10 +167,12 @@ async () => {
   for (const what of poor.values()) fault("contrast", what);
 
   // ---- links --------------------------------------------------------------------------------------------------
+  const large = all("article img, article canvas").filter((e) => shown(e) && e.getBoundingClientRect().height >= 100);
   const links = all("a[href]").map((e) => [e.href, e.getAttribute("href")]);
   const anchors = ids.concat(all("a[name]").map((e) => e.name));
   return {
     faults, links, anchors, theme,
+    picture: large.length ? Math.round(large[0].getBoundingClientRect().bottom + window.scrollY) : null,
     counts: { equations: equations.length, images: images.length, canvases: all("article canvas").length },
   };
 }

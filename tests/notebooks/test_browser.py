@@ -15,6 +15,8 @@ from urllib.parse import unquote, urlsplit
 import pytest
 from browser import Browser, BrowserError, View, Visit, find_chromium
 
+from chapters import CHAPTERS
+
 WIDE, NARROW = View(1280), View(400, dark=True)
 RULES = {
     "console": "no error and no warning",
@@ -32,6 +34,8 @@ RULES = {
     "contrast": "text stands out from its ground, 4.5 to 1, large text 3 to 1",
 }
 TABS = 2
+FIRST_SCREEN_PX = 800  # height of the window of a small laptop
+NEED_REAL_DATA = ("09_oxford_route", "10_real_radar")  # without it they have no picture
 
 
 @pytest.fixture(scope="module")
@@ -115,6 +119,19 @@ def test_every_page_was_seen_with_what_it_holds(html: Path, visits: list[Visit])
     assert len(visits) == 2 * len(pages_of(html))
     for kind in ("equations", "images", "canvases"):
         assert sum(visit.counts[kind] for visit in visits) > 0, f"no {kind} in the whole book"
+
+
+def test_chapters_have_a_picture_on_the_first_screen(visits: list[Visit]) -> None:
+    chapters = [
+        v for v in visits if "/notebooks/" in v.address and (v.picture is not None or not needs_real(v))
+    ]
+    assert len(chapters) >= 2 * (len(CHAPTERS) - len(NEED_REAL_DATA))
+    late = [f"{told(v)}: ends at {v.picture} px" for v in chapters if (v.picture or 1e9) > FIRST_SCREEN_PX]
+    assert not late, "\n".join(late)
+
+
+def needs_real(visit: Visit) -> bool:
+    return any(chapter in visit.address for chapter in NEED_REAL_DATA)
 
 
 def test_every_link_leads_somewhere(visits: list[Visit]) -> None:
@@ -246,6 +263,16 @@ def test_good_page_has_no_fault(tmp_path: Path, chromium: Browser, article: str)
 def test_rule_bites(tmp_path: Path, chromium: Browser, rule: str, article: str, words: str) -> None:
     faults = chromium.shared_tab().visit(small_page(tmp_path, article), NARROW).faults
     assert any(name == rule and words in what for name, what in faults), faults
+
+
+@pytest.mark.parametrize(("before", "ends"), [("", 0), ("<div style='height: 2000px'>words</div>", 2000)])
+def test_place_of_the_first_picture_is_told(
+    tmp_path: Path, chromium: Browser, before: str, ends: int
+) -> None:
+    picture = "<img src='dot.png' alt='A dot' style='display: block; height: 300px'>"
+    visit = chromium.shared_tab().visit(small_page(tmp_path, before + picture), WIDE)
+    assert ends + 300 < visit.picture < ends + 500
+    assert chromium.shared_tab().visit(small_page(tmp_path), WIDE).picture is None  # a dot is no picture
 
 
 @pytest.mark.parametrize(
