@@ -226,9 +226,9 @@ def chapter_with(*figures: tuple[str, bytes | None, str | None]) -> nbformat.Not
     return nbformat.v4.new_notebook(cells=cells)
 
 
-def test_chapter_opens_with_the_first_picture_that_was_drawn(tmp_path: Path) -> None:
+def test_chapter_opens_with_the_last_picture_that_was_drawn(tmp_path: Path) -> None:
     notebook = chapter_with(
-        ("fig-a", b"a", None), ("fig-b", None, "B"), ("fig-c", b"c", "C ({kind} data)"), ("fig-d", b"d", "D")
+        ("fig-a", b"a", None), ("fig-b", b"b", "B"), ("fig-c", b"c", "C ({kind} data)"), ("fig-d", None, "D")
     )
     stage_book.open_with_picture(notebook, tmp_path / "images", "05_chapter", "Virtual")
     assert (tmp_path / "images/opening-05_chapter.png").read_bytes() == b"c"

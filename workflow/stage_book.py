@@ -61,10 +61,10 @@ def fold_parameters(notebook: nbformat.NotebookNode) -> None:
 def open_with_picture(notebook: nbformat.NotebookNode, images: Path, page: str, kind: str) -> None:
     """Put a picture of the chapter below its first words, with one sentence on what it shows (in place).
 
-    It is the first figure that has a sentence in its cell's metadata (`opening`) and that the run drew; without the
+    It is the last figure that has a sentence in its cell's metadata (`opening`) and that the run drew; without the
     real data some chapters have none.
     """
-    for cell in notebook.cells:
+    for cell in reversed(notebook.cells):
         png = png_of(cell) if "opening" in cell.metadata else None
         if png is None:
             continue
