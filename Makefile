@@ -4,7 +4,7 @@
 # make weights     train a network of data/weights/recipe.yaml (NETWORK=rol) and put its weights into data/weights
 # make judge       judge the weights of a network (NETWORK=rol) again and compare with their card
 # make real        clone the public repositories with the small pieces of real data into data/real
-# make clean       remove everything made by the above but .venv and data/real
+# make clean       remove everything made by the above but .venv, data/real and the sessions that networks learn from
 #
 # Nothing is needed but Python 3.11 or 3.12, make and git; everything is installed into .venv.
 
@@ -75,5 +75,5 @@ format: $(STAMP)
 	@$(BIN)/ruff format
 
 clean:
-	@rm -rf build .snakemake .pytest_cache .ruff_cache data/sessions/demo data/sessions/smoke
-	@echo "Kept: .venv, data/real, and sessions of your own."
+	@rm -rf build .snakemake .pytest_cache .ruff_cache data/sessions/demo data/sessions/smoke data/sessions/route
+	@echo "Kept: .venv, data/real, data/sessions/weights, and sessions of your own."

@@ -35,7 +35,7 @@ PYTHON, JUPYTER_BOOK = sys.executable, Path(sys.executable).with_name("jupyter-b
 
 # One job uses the threads it was given and no more, and threads that wait leave the processor to others.
 # Figures go into the notebook, whatever the caller's environment says.
-ENVIRONMENT = "NUMBA_NUM_THREADS={threads} OMP_WAIT_POLICY=PASSIVE PYTHONHASHSEED=0 MPLBACKEND=module://matplotlib_inline.backend_inline "
+ENVIRONMENT = "env -u JPY_SESSION_NAME NUMBA_NUM_THREADS={threads} OMP_WAIT_POLICY=PASSIVE PYTHONHASHSEED=0 MPLBACKEND=module://matplotlib_inline.backend_inline "
 # papermill writes to the log, since Snakemake deletes the outputs of a failed job, and a traceback with it.
 PAPERMILL = ENVIRONMENT + (
     "{PYTHON} -m papermill {input.notebook} {log.notebook} --kernel python3 --no-progress-bar {params.arguments} "
@@ -215,6 +215,7 @@ rule real_vs_fake:
     output:
         notebook=executed("05_real_vs_fake"),
         fake=expand(OUT + "/fake/{session}/fake.json", session=SESSIONS),
+        corrected=expand(OUT + "/fake-corrected/{session}/fake.json", session=LOCALIZE),
         similarity=expand(OUT + "/similarity/{session}.json", session=SESSIONS),
     log:
         **logs("05_real_vs_fake"),
@@ -253,6 +254,7 @@ rule localization:
     input:
         notebook=source("07_localization"),
         fake=OUT + "/fake/{session}/fake.json",
+        corrected=OUT + "/fake-corrected/{session}/fake.json",
         summary=f"{OUT}/maps/summary.json",
         map=f"{OUT}/maps/{TRAIN}.npz",
         truth=OUT + "/ground_truth/{session}.tum",

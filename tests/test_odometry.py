@@ -14,6 +14,7 @@ from rol.odometry import (
     chain,
     correct_cloud,
     fit_rigid,
+    follow_map,
     icp_2d,
     local_map_odometry,
     register_robust,
@@ -428,3 +429,42 @@ def test_local_map_odometry_of_one_or_no_cloud_has_no_step():
 def test_local_map_odometry_refuses_what_is_no_drive(clouds, stamps_us, fault):
     with pytest.raises(OdometryError, match=fault):
         list(local_map_odometry(clouds, stamps_us))
+
+
+# ---- on a map, without a filter --------------------------------------------------------------------------------
+
+
+def test_follow_map_holds_the_pose_where_odometry_drifts():
+    points, truth = posts(), np.array([(float(x), 0.0, 0.02) for x in range(-15, 15, 2)])
+    steps = relative_pose(truth[:-1], truth[1:]) * (0.9, 1.0, 1.0)  # a tenth too short
+    clouds = [transform_points(invert(pose), points)[::2] for pose in truth]
+    results = list(follow_map(steps, clouds, points, truth[0]))
+    poses = np.array([result.T_target_source for result in results])
+    np.testing.assert_allclose(poses, truth, atol=0.05)
+    assert all(result.converged for result in results)
+
+
+def test_follow_map_goes_on_by_the_step_without_points_and_begins_again_where_it_is_set():
+    nothing = np.zeros((0, 2))
+
+    def supervisor(index, pose):
+        return (20.0, 0.0, 0.0) if index == 1 else None
+
+    steps = [(1.0, 0.0, 0.0)] * 2
+    results = follow_map(steps, [nothing] * 3, posts(), (0.0, 0.0, 0.0), supervisor)
+    ahead = [result.T_target_source[0] for result in results]
+    np.testing.assert_allclose(ahead, [0.0, 1.0, 21.0])
+
+
+def test_follow_map_does_not_believe_what_hardly_matches():
+    rng, false = np.random.default_rng(1), np.random.default_rng(2)
+    cloud = np.concatenate([posts()[:30], false.uniform(100.0, 140.0, (300, 2))])
+    (result,) = follow_map([], [cloud], posts(), rng.normal(0.0, 0.3, 3) * (1.0, 1.0, 0.0), reach_m=60.0)
+    assert not result.converged and result.n_matched < 0.2 * len(cloud)
+
+
+def test_follow_map_asks_for_a_step_to_each_cloud_and_for_a_map():
+    with pytest.raises(OdometryError, match="no odometry step to scan 1"):
+        list(follow_map([], [np.zeros((0, 2))] * 2, posts(), np.zeros(3)))
+    with pytest.raises(OdometryError, match="map: expected points"):
+        list(follow_map([], [np.zeros((0, 2))], np.zeros((3, 3)), np.zeros(3)))

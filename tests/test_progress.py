@@ -38,3 +38,10 @@ def test_items_are_asked_for_one_by_one() -> None:
     asked = []
     going = track((asked.append(k) or k for k in range(3)), "scans")
     assert next(going) == 0 and asked == [0]
+
+
+def test_without_tqdm_there_is_no_bar(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture) -> None:
+    monkeypatch.setenv("JPY_SESSION_NAME", "a.ipynb")
+    monkeypatch.setitem(sys.modules, "tqdm", None)
+    assert list(track(range(3), "scans")) == [0, 1, 2]
+    assert capsys.readouterr() == ("", "")

@@ -8,7 +8,11 @@ import numpy as np
 import pytest
 
 from rol import rall
-from rol.evaluation import pose_errors, rmse
+from rol.evaluation import FailureRule, pose_errors, rmse
+from rol.geometry import compose, transform_points
+from rol.mcl import build_grid, settings_for
+from rol.motion import MotionModel
+from rol.recovery import RecoverySettings
 from rol.route import (
     Route,
     RouteError,
@@ -17,10 +21,12 @@ from rol.route import (
     learn_from_others,
     list_routes,
     load_route,
+    published_level,
     published_motion,
+    run_registration,
 )
 from rol.virtual.map_points import FrontEnd
-from rol.virtual.route_runs import add_outliers, draw_session, kidnap, run_method, set_stage
+from rol.virtual.route_runs import Stage, add_outliers, draw_session, kidnap, run_method, set_stage
 
 MAP = np.array([[0.0, 0.0], [100.0, 100.0]])
 MAP_ALL = np.array([[-2000.0, -2000.0], [2000.0, 2000.0]])  # holds any route
@@ -66,7 +72,7 @@ def test_parts_that_do_not_belong_together_are_named(tmp_path: Path) -> None:
 def test_motion_is_learnt_from_another_session_if_there_is_one(tmp_path: Path) -> None:
     root = write_route(tmp_path, "03")
     model, teacher, poses = learn_from_others(root, "03", MAP)
-    assert model == published_motion() and teacher == "" and len(poses) == 60
+    assert model == published_motion() and teacher == "" and poses.shape == (0, 3)
     model, teacher, _ = learn_from_others(write_route(root, "01", n=80), "03", MAP)
     assert teacher == "01" and model != published_motion()
 
@@ -80,6 +86,93 @@ def test_the_published_odometry_is_what_session_01_teaches(real_root: Path) -> N
             np.diag(getattr(kept, name))[[0, 2]], np.diag(getattr(taught, name))[[0, 2]], atol=0.01
         )
     assert kept.matrix[1][2] == pytest.approx(taught.matrix[1][2], abs=0.05)
+
+
+def test_the_published_level_is_what_session_01_teaches(real_root: Path) -> None:
+    for front_end in (FrontEnd(), FrontEnd(0.50, 0.70), FrontEnd(0.65, 0.80), FrontEnd(0.80, 0.90)):
+        taught = set_stage(real_root, "02", front_end, max_scans=3)
+        assert taught.teacher == "01"
+        assert published_level(front_end.share_1m) == pytest.approx(taught.level, abs=0.003)
+    assert 0.048 < published_level(0.45) < 0.1 and published_level(0.3) == published_level(0.4)
+
+
+def test_a_session_alone_teaches_nothing_about_itself(real_root: Path, tmp_path: Path) -> None:
+    for name in (
+        rall.MAP_PATH,
+        f"{rall.POSES_PATH}/pose_xy_02.txt",
+        f"{rall.ODOMETRY_PATH}/seq02_odom.txt",
+    ):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).symlink_to(real_root / name)
+    stage = set_stage(tmp_path, "02", FrontEnd(), max_scans=3)
+    assert (stage.teacher, stage.level, stage.model) == ("", published_level(0.4), published_motion())
+
+
+@pytest.fixture(scope="module")
+def street() -> tuple[Route, np.ndarray, list[np.ndarray]]:
+    """A drive of 40 scans between rows of posts, its odometry a little short, and what is near in each scan."""
+    rng = np.random.default_rng(5)
+    posts = rng.uniform((-40.0, -30.0), (80.0, 30.0), (300, 2))
+    truth = np.column_stack([np.arange(40.0), np.zeros(40), 0.01 * np.arange(40.0)])
+    steps = np.tile([0.97, 0.0, 0.012], (39, 1))
+    clouds = [
+        np.column_stack([c * x + s * y, c * y - s * x]) + 0.05 * rng.standard_normal((len(posts), 2))
+        for (px, py, yaw) in truth
+        for c, s in [(np.cos(yaw), np.sin(yaw))]
+        for x, y in [(posts - (px, py)).T]
+    ]
+    return Route("09", truth, steps), posts, clouds
+
+
+def test_registration_alone_follows_good_points(street: tuple) -> None:
+    route, posts, clouds = street
+    run = run_registration(route, clouds, posts)
+    errors = pose_errors(run.poses, route.truth)
+    assert errors.position_m.max() < 0.05 and np.abs(errors.yaw_rad).max() < 0.002
+    assert not run.is_lost.any() and not run.failures and run.update_ms.shape == (40,)
+    near = [cloud[np.hypot(*cloud.T) < 20.0] for cloud in clouds]
+    seen = run_registration(route, near, posts, reach_m=25.0)
+    assert pose_errors(seen.poses, route.truth).position_m.max() < 0.2
+
+
+def test_registration_that_is_not_believed_leaves_the_guess(street: tuple) -> None:
+    route, posts, clouds = street
+    empty = [clouds[0], *[np.zeros((0, 2))] * 39]
+    run, guess = run_registration(route, empty, posts), route.truth[0]
+    assert run.is_lost.tolist() == [False] + [True] * 39
+    start = run.poses[0]
+    for k in range(1, 40):
+        start = compose(start, route.steps[k - 1])
+        np.testing.assert_allclose(run.poses[k], start, atol=1e-9)
+    assert np.hypot(*(run.poses[0] - guess)[:2]) < 0.05
+    asked = run_registration(route, clouds, posts, min_share=1.0)  # the trim leaves 90 %
+    assert asked.is_lost.all()
+
+
+def test_registration_is_set_back_to_the_truth_after_a_failure(street: tuple) -> None:
+    route, posts, _ = street
+    rule, empty = FailureRule(max_position_m=3.0, seconds=1.0), [np.zeros((0, 2))] * 40
+    run = run_registration(Route("09", route.truth, 0.5 * route.steps), empty, posts, rule)
+    assert len(run.failures) >= 2
+    for k in run.failures:
+        if k < 39:
+            off = pose_errors(run.poses[k + 1 : k + 2], route.truth[k + 1 : k + 2]).position_m[0]
+            assert off < 1.0 and pose_errors(run.poses[k : k + 1], route.truth[k : k + 1]).position_m[0] > 3.0
+
+
+def test_a_run_takes_the_registration_and_another_watch(street: tuple) -> None:
+    route, posts, clouds = street
+    stage = Stage(
+        route, posts, FrontEnd(), None, None, MotionModel(), "", 0.2, build_grid(posts, settings_for("rol"))
+    )
+    alone = run_method(stage, "registration", clouds, 1)
+    np.testing.assert_array_equal(alone.poses, run_registration(route, clouds, posts).poses)
+    wrong = [transform_points((9.0, 7.0, 0.3), cloud) for cloud in clouds]
+    told = run_method(stage, "rol", wrong, 1)
+    blind = RecoverySettings(0.2, doubt=-np.inf, lost=-np.inf)
+    quiet = run_method(stage, "rol", wrong, 1, recovery=blind)
+    assert told.is_lost.any() and not quiet.is_lost.any()
+    assert told.n_particles.max() > 1000 >= quiet.n_particles.max()
 
 
 @dataclass

@@ -24,7 +24,9 @@ import pandas as pd
 
 from rol.evaluation import consistency, pose_errors, summarize, write_text
 from rol.mcl import MclSettings, settings_for
+from rol.motion import MotionModel
 from rol.rall import find_real_root
+from rol.recovery import RecoverySettings
 from rol.route import Route, RouteRun, list_routes
 from rol.virtual.map_points import FrontEnd
 from rol.virtual.route_runs import (
@@ -53,6 +55,15 @@ INGREDIENTS = {
     "plain resampling after each scan": {"resampling": "multinomial", "resample_below": 1.0},
     "lambda of 60": {"exponent": 60.0},
 }
+UNTAUGHT = "motion as measured, not learnt"
+WATCHES = {  # ingredients that are no settings of the filter itself
+    "without recovery": {"doubt": -np.inf, "lost": -np.inf},
+    "standing scans count in full": {"still_share": 1.0},
+}
+INGREDIENTS |= {name: {} for name in (*WATCHES, UNTAUGHT)}
+NARROW = {"d_th_m": 0.25}
+QUIET = {"noise_forward_m": 0.1, "noise_side_m": 0.06, "noise_yaw_rad": 0.2 * DEG}
+TUNED = {"both": NARROW | QUIET, "d_th of 0.25 m": NARROW, "a fifth of the noise": QUIET}
 FRONTS = ((0.40, 0.60), (0.50, 0.70), (0.65, 0.80), (0.80, 0.90))
 
 
@@ -81,7 +92,7 @@ def row_of(stage: Stage, run: RouteRun, method: str, seed: int) -> dict:
         "largest_m": float(errors.position_m.max()),
         "lost_share": float(run.is_lost.mean()),
         "n_particles": float(run.n_particles.mean()),
-        **consistency(run.poses, truth, run.covariances),
+        **(consistency(run.poses, truth, run.covariances) if np.isfinite(run.covariances).all() else {}),
     }
 
 
@@ -122,8 +133,25 @@ def measure_ingredients(real_root: str, number: str, without: str, seed: int) ->
     """The method `rol` over a whole session with one of its ingredients changed."""
     changes = INGREDIENTS[without]
     stage = stage_of(real_root, number, settings=settings_for("rol", **changes))
-    run = run_method(stage, "rol", draw_session(stage, seed), seed, **changes)
+    if without == UNTAUGHT:
+        stage = replace(stage, model=MotionModel())
+    recovery = RecoverySettings(stage.level, **WATCHES.get(without, {}))
+    run = run_method(stage, "rol", draw_session(stage, seed), seed, recovery=recovery, **changes)
     return [{"without": without, **row_of(stage, run, "rol", seed)}]
+
+
+def measure_tuned(real_root: str, number: str, what: str, seed: int) -> list[dict]:
+    """The method `paper` over a whole session with the settings that were best on the first scans of session 02."""
+    stage = stage_of(real_root, number)
+    run = run_method(stage, "paper", draw_session(stage, seed), seed, **TUNED[what])
+    return [{"what": what, **row_of(stage, run, "tuned", seed)}]
+
+
+def measure_registration(real_root: str, number: str, seed: int) -> list[dict]:
+    """Registration on the map without a filter, over a whole session."""
+    stage = stage_of(real_root, number)
+    run = run_method(stage, "registration", draw_session(stage, seed), seed)
+    return [row_of(stage, run, "registration", seed)]
 
 
 def measure_fronts(real_root: str, number: str, share_1m: float, share_2m: float, seed: int) -> list[dict]:
@@ -177,6 +205,8 @@ MEASURES = {
     "settings": measure_settings,
     "fronts": measure_fronts,
     "ingredients": measure_ingredients,
+    "tuned": measure_tuned,
+    "registration": measure_registration,
     "outliers": measure_outliers,
     "rendered": measure_rendered,
     "kidnapped": measure_trial("kidnapped"),
@@ -204,9 +234,17 @@ def list_jobs(real_root: str) -> dict[str, list[tuple]]:
         "outliers": [(first, share, seed) for share in (0.015, 0.05) for seed in (1, 2, 3)],
         "anywhere": places(50, 120),
         "ingredients": [(driven[-1], name, seed) for name in INGREDIENTS for seed in (1, 2, 3, 4, 5)],
+        "tuned": list_tuned(numbers),
+        "registration": [(number, seed) for seed in (1, 2, 3) for number in numbers],
         "fronts": [(first, *shares, seed) for shares in FRONTS for seed in (1, 2, 3)],
         "rendered": [key for key in (("02", 6000, 400, 1), ("07", 5050, 400, 1)) if key[0] in numbers],
     }
+
+
+def list_tuned(numbers: list[str]) -> list[tuple]:
+    """List the jobs with better settings, away from the session that they were chosen on."""
+    judged = [number for number in numbers if number != "02"]
+    return [(number, what, seed) for number in judged for what in TUNED for seed in (1, 2, 3)]
 
 
 def stage_length(real_root: str, number: str) -> np.ndarray:

@@ -24,7 +24,10 @@ COLOURS = {
     "estimate": "#D55E00",
 }
 
-# For sessions side by side, in this order.
+# For sessions, in this order: told apart by the colour-blind too, and from all of the above.
+SESSION_COLOURS = ("#332288", "#33BBEE", "#EE3377", "#999933", "#7F3B08")
+
+# For other lines side by side, in this order.
 SERIES = ("#000000", "#0072B2", "#E69F00", "#009E73", "#D55E00", "#CC79A7")
 
 
@@ -618,8 +621,9 @@ def draw_routes(ax: Axes, ways: Sequence[np.ndarray], names: Sequence[str]) -> A
         The axes.
     """
     for index, (way, name) in enumerate(zip(ways, names, strict=True)):
-        line = ax.plot(way[:, 0], way[:, 1], color=SERIES[index % len(SERIES)], linewidth=1.4, label=name)[0]
-        ax.plot(*way[0], "o", color=line.get_color(), markersize=5)
+        colour = SESSION_COLOURS[index % len(SESSION_COLOURS)]
+        ax.plot(way[:, 0], way[:, 1], color=colour, linewidth=1.4, label=name)
+        ax.plot(*way[0], "o", color=colour, markersize=5)
     ax.set_aspect("equal", adjustable="datalim")
     ax.set(title="positions of gps.csv", xlabel="east [m]", ylabel="north [m]")
     return ax
@@ -647,9 +651,9 @@ def draw_speeds(ax: Axes, drives: Sequence[tuple[np.ndarray, np.ndarray]], names
         speeds = np.hypot(*np.diff(poses[:, :2], axis=0).T) / seconds
         base = -12.0 * index
         times = (stamps_us[1:] - stamps_us[0]) / 1e6
-        colour = SERIES[index % len(SERIES)]
+        colour = SESSION_COLOURS[index % len(SESSION_COLOURS)]
         ax.fill_between(times, base, base + speeds, color=colour, alpha=0.85, linewidth=0)
-        ax.text(0.0, base + 9.2, names[index], fontsize=9.5, color=colour)
+        ax.text(0.0, base + 9.9, names[index], fontsize=9.5)
     ax.set(
         title="speed; a strip is 12 m/s high",
         xlabel="time since the first scan [s]",
@@ -779,8 +783,9 @@ def draw_plan(
     """
     extent = (centre[0] - half, centre[0] + half, centre[1] - half, centre[1] + half)
     ax.imshow(picture, extent=extent, interpolation="antialiased")
-    ax.plot(way[:, 0], way[:, 1], color=COLOURS["estimate"], linewidth=1.8)
-    arrow = {"arrowstyle": "-|>", "color": "black", "linewidth": 2.0}
+    ax.plot(way[:, 0], way[:, 1], color=COLOURS["truth"], linewidth=1.8)
+    shape = "simple, head_width=1.0, head_length=0.8, tail_width=0.3"
+    arrow = {"arrowstyle": shape, "mutation_scale": 18, "facecolor": COLOURS["truth"], "edgecolor": "white"}
     tip = pose[:2] + 16.0 * np.array([np.cos(pose[2]), np.sin(pose[2])])
     ax.annotate("", xy=tip, xytext=pose[:2], arrowprops=arrow)
     ax.set(title=title, xlabel="town x [m]", ylabel="town y [m]", xlim=extent[:2], ylim=extent[2:])

@@ -20,7 +20,7 @@ def is_watched() -> bool:
 
 
 def track(items: Iterable[T], words: str, total: int | None = None) -> Iterator[T]:
-    """Go through items, with a bar where a person watches.
+    """Go through items, with a bar where a person watches and tqdm is installed.
 
     Parameters
     ----------
@@ -36,9 +36,11 @@ def track(items: Iterable[T], words: str, total: int | None = None) -> Iterator[
     item : object
         The items.
     """
-    if not is_watched():
+    try:
+        from tqdm import tqdm
+    except ImportError:
+        tqdm = None
+    if tqdm is None or not is_watched():
         yield from items
-        return
-    from tqdm import tqdm
-
-    yield from tqdm(items, desc=words, total=total, leave=False)
+    else:
+        yield from tqdm(items, desc=words, total=total, leave=False)

@@ -126,7 +126,7 @@ def _draw_histogram(ax: Axes, statistics: dict, look: dict) -> None:
 def _draw_zeros(ax: Axes, statistics: dict, look: dict) -> None:
     ranges, shares = zip(*statistics["zero_shares"].items(), strict=True)
     ax.plot(ranges, shares, marker="o", markersize=3.5, **look)
-    ax.set(xlabel="range [m]", ylabel="share of code 0", title="quiet cells", ylim=(0.25, 0.6))
+    ax.set(xlabel="range [m]", ylabel="share of code 0", title="quiet bins", ylim=(0.25, 0.6))
 
 
 def _draw_range_correlation(ax: Axes, statistics: dict, look: dict) -> None:

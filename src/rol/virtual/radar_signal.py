@@ -19,7 +19,7 @@ RANGE_RESOLUTION, RANGE_OFFSET = 0.0438, -0.31  # true range = (bin + 0.5) * res
 HANN_BINS = 5.9
 NOISE_STEP = 5  # the noise is limited to 1/5.9 of the band, so every fifth bin determines the others
 NOISE_RANGES_M = np.array([0.0, 3.0, 6.0, 28.0, 41.0, 80.0, 106.0, 145.0, 165.0])
-# Mean noise power at these ranges, from the share of code 0 in quiet cells.
+# Mean noise power at these ranges, from the share of code 0 in quiet bins.
 NOISE_POWERS = np.array([0.7, 0.75, 1.55, 2.25, 2.35, 2.1, 1.85, 1.55, 1.5])
 # The integer power is floor(power + 0.72): with exponential noise this fits the shares of codes 0, 6, 9, 12,
 # ...

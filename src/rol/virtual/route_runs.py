@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from ..evaluation import FailureRule
     from ..mcl import MapGrid, MclSettings
     from ..motion import MotionModel
-    from ..recovery import RecoveryUpdate
+    from ..recovery import RecoverySettings, RecoveryUpdate
     from ..route import RecoveryTrial, Route, RouteRun
     from .map_points import FrontEnd, Sight
 
@@ -47,7 +47,8 @@ class Stage:
     teacher : str
         Its number; "" where there is no other session.
     level : float
-        How much better than by chance a scan fits at its right pose, learnt from that session.
+        How much better than by chance a scan fits at its right pose, learnt from that session; where there is none,
+        `rol.route.published_level`.
     grid : MapGrid
         Of the method `rol`.
     """
@@ -100,9 +101,8 @@ def set_stage(
     """
     from ..mcl import build_grid, settings_for
     from ..rall import MAP_PATH, MAP_SHAPE, load_map_points
-    from ..recovery import measure_level
     from ..route import Route, learn_from_others, load_route
-    from .map_points import draw_clouds, look_around
+    from .map_points import look_around
 
     map_points = load_map_points(Path(real_root, MAP_PATH), MAP_SHAPE)
     route = load_route(real_root, number, map_points)
@@ -113,12 +113,21 @@ def set_stage(
     model, teacher, poses = learn_from_others(real_root, number, map_points)
     poses = poses[np.linspace(0, len(poses) - 1, min(n_level, len(poses))).astype(int)]
     grid = build_grid(map_points, settings or settings_for("rol"))
-    taught = draw_clouds(
-        map_points, poses, look_around(map_points, poses), front_end, np.random.default_rng(0)
-    )
-    level = measure_level(taught, poses, grid)
+    level = _learn_level(map_points, poses, front_end, grid)
     sight = look_around(map_points, route.truth)
     return Stage(route, map_points, front_end, sight, parts, model, teacher, level, grid)
+
+
+def _learn_level(map_points: np.ndarray, poses: np.ndarray, front_end: FrontEnd, grid: MapGrid) -> float:
+    """Learn from another session's true poses how well a scan fits at a right one; without them, what is published."""
+    from ..recovery import measure_level
+    from ..route import published_level
+    from .map_points import draw_clouds, look_around
+
+    if not len(poses):
+        return published_level(front_end.share_1m)
+    sight, rng = look_around(map_points, poses), np.random.default_rng(0)
+    return measure_level(draw_clouds(map_points, poses, sight, front_end, rng), poses, grid)
 
 
 def _find_parts(map_points: np.ndarray, poses: np.ndarray, front_end: FrontEnd) -> np.ndarray:
@@ -160,6 +169,7 @@ def run_method(
     seed: int,
     *,
     rule: FailureRule | None = None,
+    recovery: RecoverySettings | None = None,
     **changes: object,
 ) -> RouteRun:
     """Run a method over the session, started at the truth.
@@ -169,13 +179,15 @@ def run_method(
     stage : Stage
         See there.
     method : str
-        "paper" or "rol", see `rol.route.run_paper` and `rol.route.run_rol`.
+        "paper", "rol" or "registration", see `rol.route.run_paper`, `run_rol` and `run_registration` there.
     clouds : sequence of array, shape (m, 2)
         One cloud per scan [m].
     seed : int
         Of the particles.
     rule : FailureRule, optional
         What counts as a failure.
+    recovery : RecoverySettings, optional
+        Of the method `rol`, if it is to watch itself otherwise than by default.
     **changes
         Settings that differ from the method's own, see `rol.mcl.settings_for`.
 
@@ -185,13 +197,15 @@ def run_method(
     """
     from ..mcl import build_grid, settings_for
     from ..recovery import RecoverySettings
-    from ..route import run_paper, run_rol
+    from ..route import run_paper, run_registration, run_rol
 
+    if method == "registration":
+        return run_registration(stage.route, clouds, stage.map_points, rule)
     rng = np.random.default_rng([seed, int(stage.route.number), 1])
     settings = settings_for(method, **{"cell_m": CELL_M, **changes})
     if method == "paper":
         return run_paper(stage.route, clouds, build_grid(stage.map_points, settings), settings, rng, rule)
-    recovery, grid = RecoverySettings(stage.level), build_grid(stage.map_points, settings)
+    recovery, grid = recovery or RecoverySettings(stage.level), build_grid(stage.map_points, settings)
     return run_rol(stage.route, clouds, grid, stage.map_points, settings, recovery, stage.model, rng, rule)
 
 

@@ -92,7 +92,7 @@ def hellinger_distance(p: np.ndarray, q: np.ndarray) -> float:
 
 
 def zero_shares(codes: np.ndarray, ranges_m: tuple[float, ...] = ZERO_RANGES_M, half_bins: int = 15) -> dict:
-    """Give the share of code 0 in quiet cells at several ranges.
+    """Give the share of code 0 in quiet bins at several ranges.
 
     Parameters
     ----------
@@ -119,7 +119,7 @@ def zero_shares(codes: np.ndarray, ranges_m: tuple[float, ...] = ZERO_RANGES_M, 
 
 
 def noise_correlation(codes: np.ndarray, lags: int = 7, bins: tuple[int, int] = (700, 1100)) -> list[float]:
-    """Measure how alike the codes of quiet cells are along the range.
+    """Measure how alike the codes of quiet bins are along the range.
 
     Parameters
     ----------
@@ -336,7 +336,7 @@ def scan_statistics(codes: np.ndarray) -> dict:
     -------
     statistics : dict
         "histogram": share of every code; "shares": code -> share of pixels at or above it; "zero_shares": range [m] -> share of code 0 in quiet
-        cells; "range_correlation": of the noise at lags 1-7 bins; "azimuth_correlation"; "near_field": range
+        bins; "range_correlation": of the noise at lags 1-7 bins; "azimuth_correlation"; "near_field": range
         [m] -> mean code; "near_copies": True when bins 0-4 are identical; "floors": class of peak -> far
         floor; "point_spread": levels [dB] by distance; "forbidden": number of pixels with a code that cannot
         be; "greatest": greatest code; "shares_40_by_range": share of codes >= 40 by range, edges [m] as keys.
