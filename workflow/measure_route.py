@@ -235,7 +235,7 @@ def list_jobs(real_root: str) -> dict[str, list[tuple]]:
         "anywhere": places(50, 120),
         "ingredients": [(driven[-1], name, seed) for name in INGREDIENTS for seed in (1, 2, 3, 4, 5)],
         "tuned": list_tuned(numbers),
-        "registration": [(number, seed) for seed in (1, 2, 3) for number in numbers],
+        "registration": [(number, seed) for seed in (1, 2) for number in numbers],
         "fronts": [(first, *shares, seed) for shares in FRONTS for seed in (1, 2, 3)],
         "rendered": [key for key in (("02", 6000, 400, 1), ("07", 5050, 400, 1)) if key[0] in numbers],
     }

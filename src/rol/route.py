@@ -6,7 +6,7 @@ moved its particles are public, only the measurement, the fake lidar points, is 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from time import perf_counter
@@ -20,7 +20,7 @@ except ImportError:  # this file was copied on its own
     from geometry import compose, relative_pose
 
 if TYPE_CHECKING:
-    from .evaluation import FailureRule, FailureWatch
+    from .evaluation import FailureRule
     from .mcl import MapGrid, MclSettings
     from .motion import MotionModel
     from .recovery import RecoverySettings, RecoveryUpdate
@@ -327,9 +327,7 @@ def run_registration(
     clouds: Iterable[np.ndarray],
     map_points: np.ndarray,
     rule: FailureRule | None = None,
-    *,
-    reach_m: float = 75.0,
-    min_share: float = 0.2,
+    **settings: float,
 ) -> RouteRun:
     """Register each cloud on the map by ICP, without a filter: what the paper sets aside.
 
@@ -342,11 +340,8 @@ def run_registration(
         As for `run_paper`.
     map_points : array, shape (m, 2)
         The map [m].
-    reach_m : float
-        Map points farther from the guess than this are left out [m].
-    min_share : float
-        A registration that does not come to rest, or ends with a smaller share of the points in pairs, is not believed:
-        the pose then is the guess. To take it all the same was worse on 2,000 scans of the real route.
+    **settings
+        Of `rol.odometry.follow_map`.
 
     Returns
     -------
@@ -355,36 +350,13 @@ def run_registration(
         particles (NaN, NaN and 0). Yin et al. 2020, Sec. III-B.
     """
     from .evaluation import FailureRule, FailureWatch
+    from .odometry import follow_map
 
     watch = FailureWatch(route.stamps_us, route.truth, rule or FailureRule())
-    registering = _register_all(route, clouds, map_points, watch, reach_m, min_share)
+    registering = follow_map(route.steps, clouds, map_points, route.truth[0], watch, **settings)
     nothing = np.full((3, 3), np.nan)
-    rows, times = _gather(registering, lambda pair: (pair[0], nothing, pair[1], np.nan, 0))
+    rows, times = _gather(registering, lambda r: (r.T_target_source, nothing, not r.converged, np.nan, 0))
     return RouteRun(*rows[:2], watch.failures, *rows[2:], times)
-
-
-def _register_all(
-    route: Route,
-    clouds: Iterable[np.ndarray],
-    map_points: np.ndarray,
-    watch: FailureWatch,
-    reach_m: float,
-    min_share: float,
-) -> Iterator[tuple[np.ndarray, bool]]:
-    """Give the pose of each scan, and whether it is no more than the guess."""
-    from scipy.spatial import cKDTree
-
-    from .odometry import icp_2d
-
-    tree, pose = cKDTree(map_points), route.truth[0]
-    for index, cloud in enumerate(clouds):
-        guess = compose(pose, route.steps[index - 1]) if index > 0 else pose
-        found = icp_2d(cloud, map_points[tree.query_ball_point(guess[:2], reach_m)], guess)
-        is_lost = not found.converged or found.n_matched < min_share * len(cloud)
-        pose = guess if is_lost else found.T_target_source
-        yield pose, is_lost
-        set_back = watch(index, pose)
-        pose = pose if set_back is None else set_back
 
 
 def _gather(filtering: Iterable, read: Callable) -> tuple[list[np.ndarray], np.ndarray]:
