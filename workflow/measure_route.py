@@ -16,9 +16,6 @@ from functools import lru_cache
 from multiprocessing import get_context
 from pathlib import Path
 
-os.environ.setdefault("NUMBA_NUM_THREADS", "1")
-os.environ.setdefault("OMP_NUM_THREADS", "1")
-
 import numpy as np
 import pandas as pd
 
@@ -284,6 +281,8 @@ def main() -> None:
     root = find_real_root(given.real_root)
     if root is None:
         raise SystemExit("the real map is not at hand: run `make real`, or give --real-root")
+    for threads in ("NUMBA_NUM_THREADS", "OMP_NUM_THREADS"):
+        os.environ.setdefault(threads, "1")  # of each process of the pool; here it would come too late
     with ProcessPoolExecutor(given.jobs, mp_context=get_context("spawn")) as pool:
         for what, jobs in list_jobs(str(root)).items():
             if what in given.only.split(","):
