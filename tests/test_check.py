@@ -52,7 +52,7 @@ def build(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> dict:
     """A small build with its reference, and the settings of its profile."""
     monkeypatch.setattr(check, "REFERENCE", tmp_path)
     monkeypatch.setattr(check, "ROOT", tmp_path)
-    monkeypatch.setattr("rol.rall.find_real_root", lambda given: tmp_path)
+    monkeypatch.setattr(check, "find_real_root", lambda given: tmp_path)
     glue(tmp_path / "out/notebooks/02_alignment/seq01.ipynb", speed=9.5)
     glue(tmp_path / "out/notebooks/01_sessions.ipynb", words="88 % of 1,234.5 peaks")
     metrics = {"session": "seq01", "method": "paper", "seed": 1, "rmse_m": 0.25}
@@ -115,7 +115,7 @@ def test_number_on_real_data_is_skipped_only_without_the_data(
     write_reference(check.REFERENCE, [ENTRIES[3] | {"real": True}])
     Path(build["out_dir"], "scans.csv").unlink()
     assert results(build) == {"near the map": check.MISSING}
-    monkeypatch.setattr("rol.rall.find_real_root", lambda given: None)
+    monkeypatch.setattr(check, "find_real_root", lambda given: None)
     assert results(build) == {"near the map": check.SKIPPED}
 
 
@@ -153,7 +153,7 @@ def test_rerun_is_compared_with_its_session_and_method(build: dict, tmp_path: Pa
 
 @pytest.mark.parametrize("other", [{"session": "seq09"}, {"method": "rol"}])
 def test_rerun_without_a_reference_is_refused(build: dict, tmp_path: Path, other: dict) -> None:
-    with pytest.raises(ChapterError, match="there are: seq01 paper"):
+    with pytest.raises(ChapterError, match="mine.json: no reference for session "):
         compare_rerun(tmp_path, **other)
 
 
@@ -162,7 +162,7 @@ def test_rerun_with_another_seed_is_compared_within_the_spread(
 ) -> None:
     assert [row.result for row in compare_rerun(tmp_path, seed=2, rmse_m=0.34)] == [check.WITHIN]
     out = capsys.readouterr().out
-    assert "seed 2 (reference: seed 1)" in out and "spread between seeds" in out
+    assert "seed 2 (reference: seed 1; compared within the spread between seeds)" in out
     assert [row.result for row in compare_rerun(tmp_path, seed=2, rmse_m=0.36)] == [check.OUTSIDE]
 
 

@@ -26,6 +26,7 @@ from pathlib import Path
 from statistics import fmean
 
 from chapters import ROOT, ChapterError, Run, load_config
+from rol.rall import find_real_root
 
 REFERENCE = ROOT / "data" / "reference"
 PAGE = ROOT / "book" / "did_it_reproduce.md"
@@ -47,7 +48,7 @@ class Row:
 
     def cells(self) -> list[str]:
         """List the cells that the terminal and the page share: name, reference, this build, tolerance, result."""
-        numbers = [self.entry.get("value"), self.found]
+        numbers = [self.entry["value"], self.found]
         shown = ["none" if number is None else f"{number:.5g}" for number in numbers]
         return [self.entry["name"], *shown, f"{self.tolerance:.2g}", self.result]
 
@@ -131,27 +132,20 @@ def compare(entry: dict, out_dir: str | Path, has_real: bool, other_seed: bool =
     other_seed : bool
         Whether the build has another seed than the reference, so that ``seed_tol`` applies.
     """
-    value = entry.get("value")
-    allowed = max(
-        entry.get("abs_tol", 0.0),
-        entry.get("rel_tol", 0.0) * abs(value or 0.0),
-        entry.get("seed_tol", 0.0) * other_seed,
-    )
+    value = math.nan if entry["value"] is None else entry["value"]  # before it is renewed for the first time
+    allowed = max(entry.get("abs_tol", 0.0), entry.get("rel_tol", 0.0) * abs(value))
+    allowed = max(allowed, entry.get("seed_tol", 0.0) * other_seed)
     if entry.get("real", False) and not has_real:
         return Row(entry, None, allowed, SKIPPED)
     try:
         found = find_value(entry, out_dir)
     except ChapterError as error:
         return Row(entry, None, allowed, MISSING, str(error))
-    if value is None:
-        return Row(entry, found, allowed, MISSING, "no reference value; run workflow/check.py --renew")
     return Row(entry, found, allowed, WITHIN if abs(found - value) <= allowed else OUTSIDE)
 
 
 def compare_build(config: dict) -> list[Row]:
     """Compare all numbers of a profile with its build."""
-    from rol.rall import find_real_root
-
     entries = read_reference(config["profile"])["numbers"]
     has_real = find_real_root(config.get("real_root", "")) is not None
     return [compare(entry, config["out_dir"], has_real) for entry in entries]
@@ -170,27 +164,20 @@ def compare_run(reference: dict, path: str | Path) -> list[Row]:
         session, method, seed = (metrics[key] for key in ("session", "method", "seed"))
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise ChapterError(f"{path}: not a readable metrics.json ({error!r})") from error
-    runs = {}
-    for entry in reference["numbers"]:
-        file, _, key = entry["from"].partition("/metrics.json#")
-        if key:
-            runs.setdefault(tuple(file.split("/")[-2:]), []).append(
-                entry | {"from": f"file:{Path(path).name}#{key}"}
-            )
-    if (session, method) not in runs:
-        known = "; ".join(" ".join(run) for run in sorted(runs))
-        raise ChapterError(f"{path}: no reference for session {session}, method {method}; there are: {known}")
+    entries = [e for e in reference["numbers"] if f"/{session}/{method}/metrics.json#" in e["from"]]
+    if not entries:
+        raise ChapterError(f"{path}: no reference for session {session}, method {method}")
     other = seed != reference["seed"]
-    print(f"{path}: session {session}, method {method}, seed {seed} (reference: seed {reference['seed']})")
-    if other:
-        print("Another seed: compared within the spread between seeds.")
-    return [compare(entry, Path(path).parent, True, other) for entry in runs[session, method]]
+    spread = "; compared within the spread between seeds" if other else ""
+    print(f"{path}: {session}, {method}, seed {seed} (reference: seed {reference['seed']}{spread})")
+    own = [e | {"from": f"file:{Path(path).name}#{e['from'].partition('#')[2]}"} for e in entries]
+    return [compare(entry, Path(path).parent, True, other) for entry in own]
 
 
 def renew(config: dict) -> None:
     """Replace the values of a profile's reference by those of its build; names, tolerances and reasons stay."""
     reference, rows = read_reference(config["profile"]), compare_build(config)
-    gone = [row.told() for row in rows if row.found is None and row.result == MISSING]
+    gone = [row.told() for row in rows if row.result == MISSING]
     if gone:
         raise ChapterError("nothing is renewed\n" + "\n".join(gone))
     for entry, row in zip(reference["numbers"], rows, strict=True):
@@ -201,8 +188,10 @@ def renew(config: dict) -> None:
     part = path.with_suffix(".part")
     part.write_text(json.dumps(reference, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
     part.replace(path)
-    kept = sum(row.result == SKIPPED for row in rows)
-    print(f"renewed: {path.relative_to(ROOT)}, {len(rows) - kept} values; {kept} kept, which need real data")
+    kept = count_results(rows)[SKIPPED]
+    print(
+        f"renewed: {len(rows) - kept} values of {path.relative_to(ROOT)}; kept: {kept}, which need real data"
+    )
 
 
 # ---- machine --------------------------------------------------------------------------------------------------
