@@ -19,15 +19,15 @@ from rol.pairs import job_of_row
 def test_align_scans_by_hand():
     radar = np.array([0, 250_000, 500_000])
     twists = np.array([[1.0, 0.1, 0.01], [2.0, 0.2, 0.02], [3.0, 0.3, 0.03]])
-    left, right = (
-        np.array([10_000, 130_000, 260_000, 380_000]),
-        np.array([-40_000, 120_000, 265_000, 375_000]),
-    )
-    columns = align_scans(radar, radar + 125_000, twists, left, right)
+    sweeps = {
+        "left": np.array([10_000, 130_000, 260_000, 380_000]),
+        "right": np.array([-40_000, 120_000, 265_000, 375_000]),
+    }
+    columns = align_scans(radar, radar + 125_000, twists, sweeps)
     np.testing.assert_array_equal(columns["radar_stamp_us"], [0, 250_000])  # nothing within 50 ms of the last
     np.testing.assert_array_equal(columns["left_stamp_us"], [10_000, 260_000])
     np.testing.assert_array_equal(columns["right_gap_ms"], [-40.0, 15.0])
-    columns = align_scans(radar, radar + 125_000, twists, left, right, motion="corrected")
+    columns = align_scans(radar, radar + 125_000, twists, sweeps, motion="corrected")
     np.testing.assert_array_equal(columns["left_gap_ms"], [5.0, 5.0])
     np.testing.assert_array_equal(columns["right_stamp_us"], [120_000, 375_000])
     row = {name: values[1] for name, values in columns.items()}
@@ -39,7 +39,7 @@ def test_align_scans_by_hand():
         "twist": (2.0, 0.2, 0.02),
     }
     with pytest.raises(ValueError, match="motion must be"):
-        align_scans(radar, radar, twists, left, right, motion="maybe")
+        align_scans(radar, radar, twists, sweeps, motion="maybe")
 
 
 def test_usable_stamps(tmp_path):
