@@ -253,6 +253,11 @@ def test_tum_round_trip(tmp_path):
         (["1.0 0 0 0 0 0 0"], "line 1 has 7 values instead of 8"),
         (["1.0 0 0 0 0 0 0 one"], "could not convert"),
         (["# nothing"], "no pose"),
+        (
+            ["# t x y z", "1.0 0 0 0 0 0 0 1", "2.0 0 0 0 0 0 0 0"],
+            "line 3: norm of the quaternion is 0, not 1",
+        ),
+        (["1.0 0 0 0 0 0 0.5 0.5"], "line 1: norm of the quaternion is 0.707, not 1"),
         (["nan 0 0 0 0 0 0 1"], "pose 1 is not finite"),
     ],
 )

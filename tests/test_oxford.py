@@ -526,6 +526,10 @@ def test_table_writer_refuses_what_the_reader_would(tmp_path):
         (lambda t: t[:-2], "the last line is cut off"),
         (lambda t: t[:-30] + "\n", "line 3 has 9 fields, not 12"),
         (lambda t: t.splitlines()[0] + "\n", "no rows"),
+        (lambda t: t.replace("\n", ",a\n"), "unknown or doubled columns: a$"),
+        (lambda t: t.replace("down", "up"), "missing columns: down; unknown or doubled columns: up$"),
+        (lambda t: t.replace("\n", ",latitude\n"), "unknown or doubled columns: latitude$"),
+        (lambda t: "\ufeff", "file is empty"),
         (lambda t: t.replace("latitude,longitude", "longitude,latitude"), "wrong columns"),
     ],
 )
@@ -689,6 +693,35 @@ def test_a_missing_lidar_is_none_and_named_when_asked_for(session_root):
     with pytest.raises(OxfordError, match="no lidar is called 'velodyne'"):
         session.sweep_path("velodyne", START)
     assert any("velodyne_right" in fault and "missing" in fault for fault in oxford.check_session(session))
+
+
+def test_a_file_in_place_of_a_folder_is_named(session_root):
+    shutil.rmtree(session_root / "velodyne_left")
+    (session_root / "velodyne_left").touch()
+    (session_root / "velodyne_right.timestamps").unlink()
+    (session_root / "velodyne_right.timestamps").mkdir()
+    shutil.rmtree(session_root / "gt")
+    (session_root / "gt").touch()
+    session = oxford.open_session(session_root)
+    assert session.right_stamps_us is None
+    assert oxford.check_session(session) == [
+        f"{session_root}/velodyne_left: not a folder",
+        f"{session_root}/velodyne_right.timestamps: not a file",
+        f"{session_root}/gt/radar_odometry.csv: file is missing",
+    ]
+    shutil.rmtree(session_root / "radar")
+    (session_root / "radar").touch()
+    with pytest.raises(OxfordError, match="incomplete session, radar missing"):
+        oxford.open_session(session_root)
+
+
+def test_a_broken_link_is_an_empty_file(session_root):
+    path = session_root / "radar" / f"{START}.png"
+    path.unlink()
+    path.symlink_to("nowhere.png")
+    assert f"{session_root}/radar: 1 empty files, the first: {START}.png" in oxford.check_session(
+        oxford.open_session(session_root)
+    )
 
 
 def test_a_missing_sweep_is_named(session_root):

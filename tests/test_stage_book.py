@@ -25,6 +25,19 @@ def book(tmp_path: Path) -> Path:
     return tmp_path
 
 
+def test_only_a_staged_book_is_removed(tmp_path: Path) -> None:
+    (tmp_path / "_build" / "html").mkdir(parents=True)  # the workflow makes the folder of its output
+    stage_book.clear(tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == ["made.md"]
+    (tmp_path / "intro.md").touch()
+    stage_book.clear(tmp_path)
+    assert not (tmp_path / "intro.md").exists()
+    (tmp_path / "made.md").rename(tmp_path / "thesis.md")
+    with pytest.raises(ChapterError, match="holds files but no made.md"):
+        stage_book.clear(tmp_path)
+    assert (tmp_path / "thesis.md").is_file()
+
+
 @pytest.fixture(scope="module")
 def quiet_pages() -> ModuleType:
     spec = importlib.util.spec_from_file_location("quiet_pages", ROOT / "book/_ext/quiet_pages.py")

@@ -334,8 +334,14 @@ def test_changed_settings_start_anew(folder: Path, tmp_path: Path) -> None:
 def test_a_folder_of_someone_else_is_left_alone(recipe: Path, tmp_path: Path) -> None:
     (tmp_path / NAME).mkdir()
     (tmp_path / NAME / "thesis.txt").write_text("years of work", encoding="utf-8")
-    with pytest.raises(ValueError, match="not empty and without a settings.json"):
-        writer.write_session(load_settings(recipe), NAME, tmp_path)
+    (tmp_path / NAME / "radar").mkdir()
+    for content in (None, '{"listing": "pairs.json", "settings": {}}', "[]", "{"):
+        for name in ("settings.json", "radar/.1.png.1.tmp"):
+            if content is not None:
+                (tmp_path / NAME / name).write_text(content, encoding="utf-8")
+        with pytest.raises(ValueError, match="not empty and without a settings.json"):
+            writer.write_session(load_settings(recipe), NAME, tmp_path)
+    assert (tmp_path / NAME / "radar/.1.png.1.tmp").is_file()
     assert (tmp_path / NAME / "thesis.txt").read_text(encoding="utf-8") == "years of work"
 
 

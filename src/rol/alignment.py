@@ -126,7 +126,7 @@ def align_scans(
     kept = np.all([index >= 0 for index, _ in matches.values()], axis=0)
     if not kept.any():
         least = ", ".join(
-            f"{side} {np.abs(gap).min(initial=np.inf) / 1e3:g} ms" for side, (_, gap) in matches.items()
+            f"{side} {(np.abs(gap) / 1e3).min(initial=np.inf):g} ms" for side, (_, gap) in matches.items()
         )
         place = "its stamp" if motion == "none" else "mid-scan"
         raise ValueError(

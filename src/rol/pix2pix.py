@@ -675,10 +675,12 @@ def _check_header(path: str | Path, about: dict[str, Any]) -> None:
     if about.get("architecture") not in ARCHITECTURES.values():
         known = list(ARCHITECTURES.values())
         raise Pix2PixError(f"{path}: architecture {about.get('architecture')!r}, known are {known}")
-    size, numbers = (
-        about.get("image_size"),
-        [about.get("filters"), about.get("blocks"), about.get("headings", 1)],
-    )
-    if not all(type(n) is int and n > 0 for n in numbers + list(size or ())) or len(size or (1, 1)) != 2:
-        names = ("filters", "blocks", "headings", "image_size")
-        raise Pix2PixError(f"{path}: header: missing or wrong: { {name: about.get(name) for name in names} }")
+    size = about.get("image_size")
+    if size is not None and not (isinstance(size, list) and len(size) == 2):
+        raise Pix2PixError(f"{path}: header: image_size is {size!r}, expected two numbers or null")
+    numbers = {name: about.get(name) for name in ("filters", "blocks")} | {
+        "headings": about.get("headings", 1)
+    }
+    for name, number in [*numbers.items(), *(("image_size", n) for n in size or ())]:
+        if type(number) is not int or number < 0:
+            raise Pix2PixError(f"{path}: header: {name} is {number!r}, expected a whole number")
