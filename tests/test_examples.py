@@ -7,7 +7,10 @@ import ast
 import atexit
 import functools
 import importlib.metadata
+import json
+import os
 import re
+import shlex
 import shutil
 import subprocess
 import sys
@@ -199,11 +202,23 @@ def test_radar_of_ones_own_is_localized(tmp_path: Path) -> None:
     assert float(error[1]) < 0.3
 
 
-def test_session_of_ones_own_is_read_as_oxfords(tmp_path: Path) -> None:
+def test_session_of_ones_own_is_read_as_oxfords_and_aligned(tmp_path: Path) -> None:
     printed = run_with_package("Write Oxford's files", tmp_path)
     assert printed.splitlines()[0] == "[]"
     for place in re.findall(r"(\d+\.\d+) m to the left", printed):
         assert abs(float(place) - 20.0) <= 0.25
+    pytest.importorskip("papermill")
+    words = shlex.split(dict(code_blocks(OWN_RADAR, "Write Oxford's files"))["bash"])
+    command = [sys.executable, "-m", words[0], str(ROOT / words[1]), *words[2:]]
+    environment = {**os.environ, "PYTHONPATH": str(ROOT / "src"), "MPLBACKEND": "Agg"}
+    answer = subprocess.run(
+        command, cwd=tmp_path, env=environment, capture_output=True, encoding="utf-8", check=False
+    )
+    assert answer.returncode == 0, answer.stderr
+    summary = json.loads(
+        (tmp_path / "build/my-town/alignment/my-town/summary.json").read_text(encoding="utf-8")
+    )
+    assert summary["n_aligned"] == summary["n_scans"] == 4
 
 
 # ---- symbols and citations ------------------------------------------------------------------------------------
