@@ -2,15 +2,18 @@
 
 import ast
 import errno
+import json
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from rol import evaluation, files, maps, oxford, pairs
+import chapters
+from rol import evaluation, files, maps, oxford, pairs, rall
 from rol.fakes import prepare_fakes
 from rol.pairs import prepare_pairs
+from rol.virtual.settings import load_settings
 
 ROOT = Path(__file__).resolve().parents[1]
 BOM = b"\xef\xbb\xbf"
@@ -93,6 +96,11 @@ def test_other_encodings_are_named(tmp_path: Path) -> None:
             ",".join(oxford.ODOMETRY_COLUMNS) + "\n375000,125000,1,0,0,0,0,0,250000,1\n",
             lambda path: oxford.load_radar_odometry(path).steps.tolist(),
         ),
+        ("1 2 3\n", lambda path: rall.load_poses(path).tolist()),
+        ("timestamp_us,x_m,y_m,yaw_rad\n1,0,0,0\n", lambda path: list(rall.load_scan_poses(path))),
+        ("virtual: {sessions: {virtual-a: {start: 2019-01-10T11:46:21, scans: 3}}}\n", load_settings),
+        (json.dumps(METRICS), evaluation.read_metrics),
+        ((ROOT / "config" / "demo.yaml").read_text(encoding="utf-8"), chapters.load_config),
     ],
 )
 def test_a_byte_order_mark_changes_nothing(text: str, read: Callable[[Path], object], tmp_path: Path) -> None:
