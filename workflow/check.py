@@ -26,6 +26,7 @@ from pathlib import Path
 from statistics import fmean
 
 from chapters import ROOT, ChapterError, Run, load_config
+from rol.files import read_text, write_text
 from rol.rall import find_real_root
 
 REFERENCE = ROOT / "data" / "reference"
@@ -63,7 +64,7 @@ class Row:
 
 def glued_value(path: Path, name: str) -> str:
     """Read what an executed notebook glued under a name."""
-    for cell in json.loads(path.read_text(encoding="utf-8"))["cells"]:
+    for cell in json.loads(read_text(path))["cells"]:
         for output in cell.get("outputs", []):
             if output.get("metadata", {}).get("scrapbook", {}).get("name") == name:
                 return "".join(next(iter(output["data"].values())))
@@ -72,10 +73,10 @@ def glued_value(path: Path, name: str) -> str:
 
 def filed_value(path: Path, key: str) -> object:
     """Read a key of a JSON file, or the mean of a column of a CSV file."""
-    with path.open(encoding="utf-8", newline="") as file:
-        if path.suffix == ".csv":
-            return fmean(float(row[key]) for row in csv.DictReader(file))
-        return json.load(file)[key]
+    text = read_text(path)
+    if path.suffix == ".csv":
+        return fmean(float(row[key]) for row in csv.DictReader(text.splitlines()))
+    return json.loads(text)[key]
 
 
 def find_value(entry: dict, out_dir: str | Path) -> float:
@@ -111,7 +112,7 @@ def read_reference(profile: str) -> dict:
     """Read the reference of a profile: `profile`, `seed`, `machine` and the list `numbers`."""
     path = REFERENCE / f"{profile}.json"
     try:
-        return json.loads(path.read_text(encoding="utf-8"))
+        return json.loads(read_text(path))
     except FileNotFoundError:
         raise ChapterError(f"{path.relative_to(ROOT)}: there is no reference for this profile") from None
     except ValueError as error:
@@ -160,7 +161,7 @@ def compare_run(reference: dict, path: str | Path) -> list[Row]:
         If the file is not a metrics.json or no reference belongs to its session and method.
     """
     try:
-        metrics = json.loads(Path(path).read_text(encoding="utf-8"))
+        metrics = json.loads(read_text(path))
         session, method, seed = (metrics[key] for key in ("session", "method", "seed"))
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise ChapterError(f"{path}: not a readable metrics.json ({error!r})") from error
@@ -185,9 +186,7 @@ def renew(config: dict) -> None:
             entry["value"] = float(f"{row.found:.6g}")
     reference |= {"seed": config["seed"], "machine": machine()}
     path = REFERENCE / f"{config['profile']}.json"
-    part = path.with_suffix(".part")
-    part.write_text(json.dumps(reference, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
-    part.replace(path)
+    write_text(path, json.dumps(reference, indent=1, ensure_ascii=False) + "\n")
     kept = count_results(rows)[SKIPPED]
     print(
         f"renewed: {len(rows) - kept} values of {path.relative_to(ROOT)}; kept: {kept}, which need real data"
@@ -224,7 +223,7 @@ def print_table(rows: list[Row]) -> None:
     widths = [max(len(line[column]) for line in cells) for column in range(6)]
     for line in cells:
         print("  ".join(cell.ljust(width) for cell, width in zip(line, widths, strict=True)).rstrip())
-    look_at = dict(re.findall(r"^(\w+)\n: (.+)$", PAGE.read_text(encoding="utf-8"), re.MULTILINE))
+    look_at = dict(re.findall(r"^(\w+)\n: (.+)$", read_text(PAGE), re.MULTILINE))
     misses = [row for row in rows if row.result in (OUTSIDE, MISSING)]
     for row in misses:
         print(row.told())
