@@ -64,7 +64,7 @@ def test_every_real_scan_is_judged(profile: dict, real_root: Path) -> None:
     assert set(rows["timestamp_us"]) == stamps
     assert rows[shares].stack().between(0.0, 1.0).all()
     # Found from 5 m and 5 deg off; where a drive has four scans, near the fitted poses from the fourth on.
-    fitted = pd.read_csv(real_root / "oxford_scan_map_poses.csv").set_index("timestamp_us")
+    fitted = pd.read_csv("data/oxford_scan_map_poses.csv").set_index("timestamp_us")
     fitted = fitted.loc[rows["timestamp_us"]].reset_index()
     names = ["x_m", "y_m", "yaw_rad"]
     drive = (rows["timestamp_us"].diff() > 1_000_000).cumsum()
