@@ -3,7 +3,7 @@
 # make notebooks   make book, then renew the executed notebooks stored in notebooks/
 # make weights     train a network of data/weights/recipe.yaml (NETWORK=rol) and put its weights into data/weights
 # make judge       judge the weights of a network (NETWORK=rol) again and compare with their card
-# make real        clone the public repositories with the small pieces of real data into data/real
+# make real        fetch the small pieces of real data from public repositories into data/real (CHECK=1: only check them)
 # make clean       remove everything made by the above but .venv, data/real and the sessions that networks learn from
 #
 # Nothing is needed but Python 3.11 or 3.12, make and git; everything is installed into .venv.
@@ -56,15 +56,8 @@ weights: $(STAMP)
 judge: $(STAMP)
 	@OMP_WAIT_POLICY=PASSIVE $(BIN)/python workflow/train_weights.py data/weights/recipe.yaml $(NETWORK) --threads $(CORES) --judge
 
-real:
-	@mkdir -p data/real
-	@for repository in ZJUYH/RaLL Samleo8/RadarSLAMPy marcelsheeny/radiate_sdk; do \
-	    folder=data/real/$${repository#*/}; \
-	    if [ -d "$$folder" ]; then echo "$$folder is there"; continue; fi; \
-	    rm -rf "$$folder.part"; \
-	    git clone --depth 1 "https://github.com/$$repository.git" "$$folder.part"; \
-	    mv "$$folder.part" "$$folder"; \
-	done
+real: $(STAMP)
+	@$(BIN)/python workflow/get_real.py $(if $(CHECK),--check)
 
 lint: $(STAMP)
 	@$(BIN)/ruff check
