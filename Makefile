@@ -4,6 +4,7 @@
 # make weights     train a network of data/weights/recipe.yaml (NETWORK=rol) and put its weights into data/weights
 # make judge       judge the weights of a network (NETWORK=rol) again and compare with their card
 # make real        fetch the small pieces of real data from public repositories into data/real (CHECK=1: only check them)
+# make archive     one zip of code, executed notebooks, book and results with an RO-Crate, after make book
 # make clean       remove everything made by the above but .venv, data/real and the sessions that networks learn from
 #
 # Nothing is needed but Python 3.11 or 3.12, make and git; everything is installed into .venv.
@@ -11,7 +12,7 @@
 SHELL := bash
 .SHELLFLAGS := -eu -o pipefail -c
 .DEFAULT_GOAL := help
-.PHONY: help setup book test notebooks weights judge real lint format clean
+.PHONY: help setup book test notebooks weights judge real archive lint format clean
 
 BIN := .venv/bin
 # The stamp's name is the sum of what is installed, so a changed lock file asks for another stamp.
@@ -58,6 +59,9 @@ judge: $(STAMP)
 
 real: $(STAMP)
 	@$(BIN)/python workflow/get_real.py $(if $(CHECK),--check)
+
+archive: $(STAMP)
+	@$(BIN)/python workflow/archive.py config/$(PROFILE).yaml
 
 lint: $(STAMP)
 	@$(BIN)/ruff check
