@@ -174,9 +174,10 @@ def test_command_checks_and_fetches(
 
 
 def test_list_is_whole() -> None:
-    repositories = load_list()
+    repositories, page = load_list(), (get_real.ROOT / "data" / "README.md").read_text()
     assert len({repository["folder"] for repository in repositories}) == len(repositories) == 8
     for repository in repositories:
+        assert f"| {repository['repository']} |" in page
         assert re.fullmatch("[0-9a-f]{40}", repository["commit"]) and repository["files"]
         assert repository["folder"] == repository["repository"].partition("/")[2]
         for name, digest in repository["files"].items():

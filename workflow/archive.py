@@ -87,8 +87,8 @@ def parse_summary(table: str, profile: str) -> list[Job]:
     faults = []
     for line in table.splitlines()[1:]:
         output, _, rule, logs, inputs, command, status, plan = line.split("\t")
-        if plan != "no update":
-            faults.append(f"{output}: {'missing' if status == 'missing' else 'out of date'}")
+        if status == "missing" or plan != "no update":
+            faults.append((output, "missing" if status == "missing" else "out of date"))
             continue
         command = re.sub(r"\S*/bin/python\S*", "python", command).partition(" > ")[0]
         name = (rule, output if logs == "-" else logs)
@@ -96,7 +96,10 @@ def parse_summary(table: str, profile: str) -> list[Job]:
         jobs[name] = Job(rule, tuple(inputs.split(",")), (*before, output), command)
     if faults:
         more = f" (and {len(faults) - 1} more)" if faults[1:] else ""
-        raise ArchiveError(f"{faults[0]}{more}; run `make book PROFILE={profile}` first")
+        raise ArchiveError(
+            f"{faults[0][0]}: {faults[0][1]}{more}; run `make book PROFILE={profile}` first. If that leaves it so: "
+            f"`.venv/bin/snakemake --configfile config/{profile}.yaml --cores 2 {faults[0][0]}`"
+        )
     return list(jobs.values())
 
 
@@ -196,7 +199,8 @@ def add_action(crate: Any, files: Mapping[str, bytes], job: Job, made: list[str]
     """Add what one job did to a crate: its command, notebook, inputs, outputs and times."""
     from rocrate.model.contextentity import ContextEntity
 
-    source = next((path for path in job.inputs if path.startswith("notebooks/")), "Snakefile")
+    notebook = re.search(r"-m papermill (\S+)", job.command)
+    source = notebook[1] if notebook else "Snakefile"
     instrument = entity(crate, files, source)
     properties = {
         "@type": "CreateAction",
