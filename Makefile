@@ -4,7 +4,8 @@
 # make notebooks   make book, then renew the executed notebooks stored in notebooks/
 # make weights     train a network of data/weights/recipe.yaml (NETWORK=rol) and put its weights into data/weights
 # make judge       judge the weights of a network (NETWORK=rol) again and compare with their card
-# make real        clone the public repositories with the small pieces of real data into data/real
+# make real        fetch the small pieces of real data from public repositories into data/real (CHECK=1: only check them)
+# make archive     one zip of code, executed notebooks, book and results with an RO-Crate, after make book
 # make clean       remove everything made by the above but .venv, data/real and the sessions that networks learn from
 #
 # Nothing is needed but Python 3.11 or 3.12, make and git; everything is installed into .venv.
@@ -12,7 +13,7 @@
 SHELL := bash
 .SHELLFLAGS := -eu -o pipefail -c
 .DEFAULT_GOAL := help
-.PHONY: help setup book test check notebooks weights judge real lint format clean
+.PHONY: help setup book test check notebooks weights judge real archive lint format clean
 
 # UTF-8 whatever the locale is, also in the tools that are called.
 export PYTHONUTF8 := 1
@@ -64,15 +65,11 @@ weights: $(STAMP)
 judge: $(STAMP)
 	@OMP_WAIT_POLICY=PASSIVE $(BIN)/python workflow/train_weights.py data/weights/recipe.yaml $(NETWORK) --threads $(CORES) --judge
 
-real:
-	@mkdir -p data/real
-	@for repository in ZJUYH/RaLL Samleo8/RadarSLAMPy marcelsheeny/radiate_sdk; do \
-	    folder=data/real/$${repository#*/}; \
-	    if [ -d "$$folder" ]; then echo "$$folder is there"; continue; fi; \
-	    rm -rf "$$folder.part"; \
-	    git clone --depth 1 "https://github.com/$$repository.git" "$$folder.part"; \
-	    mv "$$folder.part" "$$folder"; \
-	done
+real: $(STAMP)
+	@$(BIN)/python workflow/get_real.py $(if $(CHECK),--check)
+
+archive: $(STAMP)
+	@$(BIN)/python workflow/archive.py config/$(PROFILE).yaml
 
 lint: $(STAMP)
 	@$(BIN)/ruff check

@@ -362,7 +362,7 @@ def stage(config_path: str) -> Path:
     stage_result_figure(config, book)
     modules = stage_toolbox(book)
     write_text(book / "made.md", how_made_page(config, config_path))
-    write_text(book / check.PAGE.name, reproduced_page(config))
+    write_text(book / "did_it_reproduce.md", reproduced_page(config))
     pages = book_pages(config)
     for page in book.glob("*.md"):
         write_text(page, point_to_pages(read_text(page), pages))
