@@ -319,7 +319,7 @@ def stage(config_path: str) -> Path:
     config = load_config(config_path)
     book = Path(config["book_dir"])
     shutil.rmtree(book, ignore_errors=True)
-    shutil.copytree(ROOT / "book", book)
+    shutil.copytree(ROOT / "book", book, ignore=shutil.ignore_patterns("._*"))
     stage_notebooks(config, book)
     stage_result_figure(config, book)
     modules = stage_toolbox(book)
