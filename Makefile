@@ -6,11 +6,13 @@
 # make real        clone the public repositories with the small pieces of real data into data/real
 # make clean       remove everything made by the above but .venv, data/real and the sessions that networks learn from
 #
-# Nothing is needed but Python 3.11 or 3.12, make and git; everything is installed into .venv.
+# README.md names what the system must have; everything else is installed into .venv.
 
 SHELL := bash
 .SHELLFLAGS := -eu -o pipefail -c
 .DEFAULT_GOAL := help
+# Whatever the locale, files and the names of folders are UTF-8.
+export PYTHONUTF8 := 1
 .PHONY: help setup book test notebooks weights judge real lint format clean
 
 BIN := .venv/bin
