@@ -78,10 +78,10 @@ pip_settings >"$system/etc/pip.conf"
 shared=$(named_paths)
 readarray -t variables < <(env | grep -E "$passed")
 git clone -q . "$system/srv/$clone"
-mkdir "$system/srv/home"
-chown -R 1000:1000 "$system/srv"
+inside "$system" useradd --create-home --home-dir /srv/reader reader
+chown -R --reference="$system/srv/reader" "$system/srv/$clone"
 as_user() {
-    inside --userspec=1000:1000 "$system" env -i PATH=/usr/bin:/bin LANG=C.UTF-8 HOME=/srv/home "${variables[@]}" \
+    inside --userspec=reader:reader "$system" env -i PATH=/usr/bin:/bin LANG=C.UTF-8 HOME=/srv/reader "${variables[@]}" \
         bash -euc "cd \"/srv/$clone\"; $1"
 }
 say "$(. "$system/etc/os-release" && echo "$PRETTY_NAME"), $(as_user 'python3 --version'), commit $(git rev-parse --short HEAD)"
