@@ -1,6 +1,7 @@
 """The Snakefile with a stand-in for papermill: paths of any name, checkpoints that are continued, one run at a time."""
 
 import os
+import re
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -73,6 +74,13 @@ def environment(root: Path) -> dict[str, str]:
     """Give the environment in which the interpreter finds the stand-in first, with an ASCII locale."""
     paths = [root / "stub", *(path for path in sys.path if "site-packages" in path)]
     return os.environ | {"PYTHONPATH": os.pathsep.join(map(str, paths)), "LC_ALL": "C"}
+
+
+def test_every_path_in_a_command_is_quoted() -> None:
+    names = r"PYTHON|JUPYTER_BOOK|(?:input|output|log)(?:\.\w+)?"
+    text = (ROOT / "Snakefile").read_text(encoding="utf-8")
+    assert re.findall(rf"\{{(?:{names})\}}", text) == []
+    assert len(re.findall(rf"\{{(?:{names}):q\}}", text)) > 10
 
 
 @pytest.mark.slow
