@@ -23,7 +23,7 @@ if not workflow.configfiles:
     configfile: "config/demo.yaml"
 
 CONFIG_FILE = os.path.relpath(workflow.configfiles[-1])
-if workflow.is_main_process and not workflow.output_settings.dryrun:
+if workflow.is_main_process and not workflow.output_settings.dryrun:  # the Snakemake of a job is no main process
     run_lock.wait_for_lock(".snakemake/run.lock", CONFIG_FILE)
 chapters.check_config(config, CONFIG_FILE)
 SESSIONS_ROOT, OUT, BOOK = config["sessions_root"], config["out_dir"], config["book_dir"]
