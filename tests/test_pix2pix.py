@@ -18,6 +18,7 @@ from rol.pix2pix import (
     TrainConfig,
     build_discriminator,
     build_generator,
+    choose_bf16,
     entropy_loss,
     evaluate_l1,
     gan_loss,
@@ -199,6 +200,15 @@ def test_step_in_bfloat16_keeps_weights_in_full_precision() -> None:
     losses = train_step(*networks, *optimizers(*networks), radar, lidar, TrainConfig(bf16=True))
     assert all(math.isfinite(loss) for loss in losses.values())
     assert all(weight.dtype == torch.float32 for weight in networks[0].parameters())
+
+
+def test_bf16_is_chosen_by_the_processor_unless_it_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    for there in (False, True):
+        monkeypatch.setattr("rol.pix2pix.has_bf16", lambda device, there=there: there)
+        assert [choose_bf16(value) for value in (False, True, "auto")] == [False, True, there]
+    for value in ("yes", 1, None):
+        with pytest.raises(Pix2PixError, match='bf16: expected true, false or "auto"'):
+            choose_bf16(value)
 
 
 def test_steps_of_a_run_count_epochs_unless_told() -> None:
