@@ -65,8 +65,8 @@ def test_modules_as_text_compile_in_memory() -> None:
 
 
 def test_module_without_any_folder_for_the_cache_compiles_in_memory(tmp_path: Path) -> None:
-    (tmp_path / "__pycache__").write_text("a file in place of the folder")
-    (tmp_path / "doubled.py").write_text(DOUBLE)
+    (tmp_path / "__pycache__").write_text("a file in place of the folder", encoding="utf-8")
+    (tmp_path / "doubled.py").write_text(DOUBLE, encoding="utf-8")
     run_without_home(
         "import sys; sys.path.insert(0, sys.argv[1]); import doubled; assert doubled.double(21) == 42",
         tmp_path,
@@ -77,7 +77,7 @@ def test_module_without_any_folder_for_the_cache_compiles_in_memory(tmp_path: Pa
 @pytest.mark.parametrize("kept", [0, 20])
 def test_damaged_cache_is_replaced(kind: str, kept: int, tmp_path: Path) -> None:
     path = tmp_path / "doubled.py"
-    path.write_text(DOUBLE)
+    path.write_text(DOUBLE, encoding="utf-8")
     assert [cache_hits(path), cache_hits(path)] == [0, 1]
     [file] = (tmp_path / "__pycache__").glob(f"*.{kind}")
     file.write_bytes(file.read_bytes()[:kept])
@@ -89,7 +89,7 @@ def test_damaged_cache_that_cannot_be_replaced_is_passed_over(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = tmp_path / "doubled.py"
-    path.write_text(DOUBLE)
+    path.write_text(DOUBLE, encoding="utf-8")
     double = load_double(path)
 
     def refuse(*_: object) -> None:

@@ -163,25 +163,25 @@ class Place:
             ROOT / "workflow", self.root / "workflow", ignore=shutil.ignore_patterns("__pycache__")
         )
         shutil.copy(ROOT / "apt.txt", self.root)
-        (self.root / "requirements.lock").write_text("torch==1.2.3\nuv==1\n")
+        (self.root / "requirements.lock").write_text("torch==1.2.3\nuv==1\n", encoding="utf-8")
         brought = folder / "brought-python"
         self.environment = {"LOG": str(self.log), "FAULTS": str(self.faults), "BROUGHT": str(brought)}
         for path in (folder / "bin" / "python3", brought):
-            path.write_text(PRETENDER)
+            path.write_text(PRETENDER, encoding="utf-8")
             path.chmod(0o755)
         for tool in TOOLS:
             (folder / "bin" / tool).symlink_to(shutil.which(tool))
         self.environment["PATH"] = str(folder / "bin")
 
     def set_up(self, **variables: str) -> subprocess.CompletedProcess:
-        self.log.write_text("")
+        self.log.write_text("", encoding="utf-8")
         return subprocess.run(
             ["workflow/set_up.sh", ".venv", ".venv/set-up-1"],
             cwd=self.root, env=self.environment | variables, capture_output=True, text=True, check=False,
         )  # fmt: skip
 
     def fail(self, what: str, message: str = "") -> None:
-        (self.faults / what).write_text(message)
+        (self.faults / what).write_text(message, encoding="utf-8")
 
     @property
     def done(self) -> bool:
@@ -197,7 +197,8 @@ def test_set_up_asks_uv_for_torch_and_pip_for_the_rest(place: Place) -> None:
     answer = place.set_up()
     assert (answer.returncode, answer.stderr, place.done) == (0, "", True)
     steps = re.findall(
-        r"-m venv|--torch-backend=auto torch==1.2.3|-r requirements.lock|import open3d", place.log.read_text()
+        r"-m venv|--torch-backend=auto torch==1.2.3|-r requirements.lock|import open3d",
+        place.log.read_text(encoding="utf-8"),
     )
     assert steps == ["-m venv", "--torch-backend=auto torch==1.2.3", "-r requirements.lock", "import open3d"]
     assert not (place.root / ".venv/unfinished").exists()
@@ -220,7 +221,7 @@ def test_missing_library_is_named_with_the_packages(place: Place) -> None:
     )
     (place.faults / "open3d").unlink()
     assert place.set_up().returncode == 0 and place.done
-    assert "-m venv" not in place.log.read_text()
+    assert "-m venv" not in place.log.read_text(encoding="utf-8")
 
 
 @pytest.mark.parametrize("fault", ["pip", "killed"])
@@ -230,14 +231,14 @@ def test_interrupted_set_up_begins_anew(place: Place, fault: str) -> None:
     assert place.set_up().returncode != 0 and not place.done
     (place.faults / fault).unlink()
     assert place.set_up().returncode == 0 and place.done
-    assert "-m venv --clear .venv" in place.log.read_text()
+    assert "-m venv --clear .venv" in place.log.read_text(encoding="utf-8")
 
 
 def test_python_is_brought_by_uv_where_none_fits(place: Place) -> None:
     answer = place.set_up(UNFIT="1")
     assert answer.returncode == 0 and place.done, answer.stderr
     assert "asking uv for Python 3.13" in answer.stderr
-    assert "brought-python -m venv --clear .venv" in place.log.read_text()
+    assert "brought-python -m venv --clear .venv" in place.log.read_text(encoding="utf-8")
 
 
 @pytest.mark.parametrize(
@@ -260,7 +261,7 @@ def test_python_that_was_named_and_does_not_fit_is_refused(place: Place) -> None
 @pytest.mark.parametrize("locale", ["C", "en_US.ISO-8859-1"])
 def test_make_sets_up_in_a_folder_with_spaces_whatever_the_locale(place: Place, locale: str) -> None:
     shutil.copy(ROOT / "Makefile", place.root)
-    (place.root / "pyproject.toml").write_text("")
+    (place.root / "pyproject.toml").write_text("", encoding="utf-8")
     variables = os.environ | place.environment | {"PATH": f"{place.environment['PATH']}:{os.environ['PATH']}"}
     variables |= {"LC_ALL": locale, "PYTHONUTF8": "0", "PYTHON": "python3"}
     command = ["make", "--no-print-directory", "setup"]
