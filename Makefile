@@ -1,5 +1,6 @@
 # make book        set up, run the chapters on the demo profile, render the book
 # make test        set up, then lint, unit tests, all chapters on the smoke profile, and checks of what came out
+# make check       compare the numbers of a build with the reference (PROFILE=demo; RUN=.../metrics.json: one rerun)
 # make notebooks   make book, then renew the executed notebooks stored in notebooks/
 # make weights     train a network of data/weights/recipe.yaml (NETWORK=rol) and put its weights into data/weights
 # make judge       judge the weights of a network (NETWORK=rol) again and compare with their card
@@ -12,8 +13,10 @@
 SHELL := bash
 .SHELLFLAGS := -eu -o pipefail -c
 .DEFAULT_GOAL := help
-.PHONY: help setup book test notebooks weights judge real archive lint format clean
+.PHONY: help setup book test check notebooks weights judge real archive lint format clean
 
+# UTF-8 whatever the locale is, also in the tools that are called.
+export PYTHONUTF8 := 1
 BIN := .venv/bin
 # The stamp's name is the sum of what is installed, so a changed lock file asks for another stamp.
 STAMP := .venv/set-up-$(shell cat requirements.lock pyproject.toml | cksum | cut -d ' ' -f 1)
@@ -35,6 +38,7 @@ book: $(STAMP)
 	@$(SNAKEMAKE) --unlock --quiet all
 	@time $(SNAKEMAKE) book --prioritize pix2pix --rerun-incomplete --retries 1 --scheduler greedy --quiet host reason
 	@echo "The book: $$($(BIN)/python workflow/stage_book.py --where config/$(PROFILE).yaml) (open it in a browser, no network needed)"
+	@$(BIN)/python workflow/check.py config/$(PROFILE).yaml || true
 
 test: $(STAMP) lint
 	@mkdir -p build/test
@@ -48,8 +52,12 @@ test: $(STAMP) lint
 	@echo "every module by itself (unit tests):"
 	@tail -n 1 build/test/unit.log
 
+check: $(STAMP)
+	@$(BIN)/python workflow/check.py config/$(PROFILE).yaml $(if $(RUN),--run "$(RUN)")
+
 notebooks: book
 	@$(BIN)/python workflow/renew_notebooks.py config/demo.yaml
+	@$(BIN)/python workflow/check.py --renew config/demo.yaml
 
 weights: $(STAMP)
 	@OMP_WAIT_POLICY=PASSIVE $(BIN)/python workflow/train_weights.py data/weights/recipe.yaml $(NETWORK) --threads $(CORES)

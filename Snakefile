@@ -95,7 +95,8 @@ rule book:
         sources=[f"notebooks/{chapter}.ipynb" for chapter in chapters.CHAPTERS],
         pages=[str(path) for path in sorted(Path("book").rglob("*")) if path.is_file()],
         modules=[str(path) for path in sorted(Path("src/rol").rglob("*.py"))],
-        stage=["workflow/stage_book.py", "workflow/toolbox_pages.py"],
+        stage=["workflow/stage_book.py", "workflow/toolbox_pages.py", "workflow/check.py"],
+        reference=[str(path) for path in sorted(Path("data/reference").glob("*.json"))],
     output:
         f"{BOOK}/_build/html/index.html",
     log:
@@ -127,7 +128,8 @@ rule virtual_session:
     message:
         "virtual session {wildcards.session}"
     shell:  # the writer goes on with what is there, which is right after a stop and wrong after a change of its code
-        'made={SESSIONS_ROOT}/{wildcards.session}; [ "$(cat $made.code 2>/dev/null)" = {params.code} ] || rm -rf "$made"; '
+        'made={SESSIONS_ROOT}/{wildcards.session}; [ "$(cat $made.code 2>/dev/null)" = {params.code} ] '
+        """|| ! grep -qs '"format":' "$made/settings.json" || rm -rf "$made"; """
         "echo {params.code} > $made.code; "
         + ENVIRONMENT + "{PYTHON} -m rol.virtual {CONFIG_FILE} --session {wildcards.session} --out {SESSIONS_ROOT} "
         "> {log} 2>&1 || {{ tail -n 30 {log}; exit 1; }}"

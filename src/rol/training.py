@@ -6,7 +6,6 @@ seed and the number of the step. So a run that was stopped goes on to the very l
 
 from __future__ import annotations
 
-import os
 import zlib
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
@@ -201,6 +200,7 @@ def train(
     -----
     Yin et al. 2020, Sec. III-A and IV-A.
     """
+    from .files import write_text
     from .pix2pix import evaluate_l1, save_weights
 
     _check_run(dataset, config)
@@ -226,9 +226,7 @@ def train(
         if state.step % config.checkpoint_every == 0 or state.step == n_steps:
             state.save(checkpoint, about)
     history = pd.DataFrame(state.history, columns=HISTORY_COLUMNS)
-    temporary = folder / f".history.csv.{os.getpid()}.tmp"
-    history.to_csv(temporary, index=False)
-    os.replace(temporary, folder / "history.csv")
+    write_text(folder / "history.csv", history.to_csv(index=False))
     save_weights(
         folder / "generator.safetensors", generator, {**(metadata or {}), **about, "step": state.step}
     )
