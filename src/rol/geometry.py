@@ -7,6 +7,10 @@ pose of ``b`` as seen from ``a``. A 3D transform is a 4 x 4 matrix with the same
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import fields
+from typing import Any
+
 import numpy as np
 
 
@@ -53,6 +57,49 @@ def check_poses(poses: np.ndarray, name: str = "poses") -> np.ndarray:
         first = np.argwhere(~np.isfinite(poses))[0]
         raise ValueError(f"{name}: value at index {tuple(int(i) for i in first)} is not finite")
     return poses
+
+
+def check_fields(
+    settings: Any, allowed: Mapping[str | tuple[str, ...], str], error: type[ValueError] = ValueError
+) -> None:
+    """Check that the fields of a settings class are in their ranges.
+
+    Parameters
+    ----------
+    settings : dataclass
+        Instance to check; fields declared as ``int`` must be whole numbers, tuples are checked value by value.
+    allowed : mapping
+        Range or choices -> names of the fields, separated by spaces. A range is written as an interval, such as
+        "(0, inf)", where a bracket includes the bound; choices are a tuple of words.
+    error : type
+        Exception to raise.
+
+    Raises
+    ------
+    ValueError
+        Or the given ``error``, with the field's name, its value and what is allowed; NaN is in no range.
+    """
+    kinds = {field.name: str(field.type) for field in fields(settings)}
+    for span, names in allowed.items():
+        for name in names.split():
+            value = getattr(settings, name)
+            if isinstance(span, tuple):
+                if value not in span:
+                    raise error(f"{name}: {value!r} is none of {', '.join(span)}")
+            elif not _is_in(value, span, kinds[name] == "int"):
+                kind = "a whole number in " if kinds[name] == "int" else "in "
+                raise error(f"{name}: {value} is not {kind}{span}")
+
+
+def _is_in(value: Any, span: str, is_whole: bool) -> bool:
+    """Say whether a number, or each number of nested tuples, lies in an interval such as "[0, 1)"."""
+    values = np.asarray(value)
+    if values.dtype.kind not in ("iu" if is_whole else "iuf"):
+        return False
+    low, high = (float(bound) for bound in span[1:-1].split(","))
+    above = values >= low if span[0] == "[" else values > low
+    below = values <= high if span[-1] == "]" else values < high
+    return bool((above & below).all())
 
 
 def compose(T_a_b: np.ndarray, T_b_c: np.ndarray) -> np.ndarray:

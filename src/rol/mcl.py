@@ -15,9 +15,9 @@ import numpy as np
 from numba import get_num_threads, njit, prange
 
 try:
-    from .geometry import check_poses, compose, wrap_angle
+    from .geometry import check_fields, check_poses, compose, wrap_angle
 except ImportError:  # this file was copied on its own
-    from geometry import check_poses, compose, wrap_angle
+    from geometry import check_fields, check_poses, compose, wrap_angle
 
 
 class MclError(ValueError):
@@ -68,6 +68,11 @@ class MclSettings:
     min_particles : int
         Below ``n_particles`` their number follows the particles' spread, see `count_needed`, but never falls under
         this; 0 keeps it as it is.
+
+    Raises
+    ------
+    MclError
+        If a value is out of its range; the message names it.
     """
 
     n_particles: int = 500
@@ -87,6 +92,18 @@ class MclSettings:
     resample_below: float = 1.0
     cell_m: float = 0.125
     min_particles: int = 0
+
+    def __post_init__(self) -> None:
+        allowed = {
+            "[1, inf)": "n_particles",
+            "(0, inf)": "exponent d_th_m sigma_m cell_m",
+            "[0, inf)": "noise_forward_m noise_side_m noise_yaw_rad noise_per_m noise_yaw_per_rad "
+            "start_spread_m start_spread_yaw_rad crowd_m min_particles",
+            "[0, 1]": "resample_below",
+            ("count", "distance"): "likelihood",
+            ("multinomial", "systematic"): "resampling",
+        }
+        check_fields(self, allowed, MclError)
 
 
 def settings_for(method: str, **changes: object) -> MclSettings:
@@ -109,7 +126,7 @@ def settings_for(method: str, **changes: object) -> MclSettings:
     Raises
     ------
     MclError
-        If the method is unknown.
+        If the method is unknown, or a value is out of its range.
     """
     methods = {
         "paper": MclSettings(),
@@ -278,8 +295,6 @@ def build_grid(map_points: np.ndarray, settings: MclSettings) -> MapGrid:
     """
     if settings.likelihood == "count":
         return build_matched_grid(map_points, settings.d_th_m, settings.cell_m)
-    if settings.likelihood != "distance":
-        raise MclError(f"unknown likelihood {settings.likelihood!r}; there are count, distance")
     return build_distance_grid(map_points, settings.sigma_m, settings.cell_m, settings.crowd_m)
 
 

@@ -23,9 +23,9 @@ from numba import njit, prange
 from scipy.spatial import cKDTree
 
 try:
-    from ..geometry import check_poses, invert, transform_points
+    from ..geometry import check_fields, check_poses, invert, transform_points
 except ImportError:  # this file was copied on its own
-    from geometry import check_poses, invert, transform_points
+    from geometry import check_fields, check_poses, invert, transform_points
 
 KINDS = ("near", "beside", "false")
 
@@ -52,6 +52,11 @@ class FrontEnd:
         How many scans such a point is seen on average.
     min_range_m, max_range_m : float
         Reach of the front end [m]; 64 m is the paper's.
+
+    Raises
+    ------
+    MapPointsError
+        If a value is out of its range; the message names it.
     """
 
     share_1m: float = 0.40
@@ -62,6 +67,15 @@ class FrontEnd:
     life_scans: float = 8.0
     min_range_m: float = 2.5
     max_range_m: float = 64.0
+
+    def __post_init__(self) -> None:
+        allowed = {
+            "[0, 1]": "share_1m share_2m persistent_share",
+            "[0, inf)": "n_points near_m min_range_m",
+            "[1, inf)": "life_scans",
+            "(0, inf)": "max_range_m",
+        }
+        check_fields(self, allowed, MapPointsError)
 
 
 @dataclass(frozen=True)
