@@ -91,6 +91,7 @@ def test_the_classes_are_all_there() -> None:
         (FailureRule, {"seconds": -1.0}, EvaluationError, "seconds: -1.0 is not in"),
         (TrainConfig, {"batch": 0}, Pix2PixError, "batch: 0 is not a whole number in"),
         (TrainConfig, {"beta1": 1.0}, Pix2PixError, "beta1: 1.0 is not in"),
+        (TrainConfig, {"network": "vnet"}, Pix2PixError, "network: 'vnet' is none of resnet, unet"),
         (TrainConfig, {"pixel_loss": "l2"}, Pix2PixError, "pixel_loss: 'l2' is none of l1, entropy"),
         (FrontEnd, {"share_1m": 40.0}, MapPointsError, "share_1m: 40.0 is not in"),
         (RadarSettings, {"layer_widths_deg": (0.8, 0.0)}, ValueError, "layer_widths_deg: .* is not in"),

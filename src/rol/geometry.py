@@ -13,6 +13,11 @@ from typing import Any
 
 import numpy as np
 
+MAX_EXTENT_M, MAX_GRID_BYTES = (
+    1e5,
+    2**33,
+)  # a map beyond 100 km, a grid beyond 8 GiB: a stray point, most likely
+
 
 def wrap_angle(angle: np.ndarray | float) -> np.ndarray | float:
     """Wrap an angle to the half-open interval [-pi, pi).
@@ -100,6 +105,53 @@ def _is_in(value: Any, span: str, is_whole: bool) -> bool:
     above = values >= low if span[0] == "[" else values > low
     below = values <= high if span[-1] == "]" else values < high
     return bool((above & below).all())
+
+
+def check_grid(
+    shape: tuple[float, ...] | np.ndarray,
+    points: np.ndarray,
+    name: str,
+    *,
+    n_bytes: int = 1,
+    error: type[ValueError] = ValueError,
+) -> tuple[int, ...]:
+    """Check, before it is allocated, that a grid around points is of a size that memory holds.
+
+    Parameters
+    ----------
+    shape : sequence of float
+        Cells in each direction.
+    points : array, shape (m, 2)
+        Points that the grid is made for, at least one [m].
+    name : str
+        What the points are called in the message, such as "map".
+    n_bytes : int
+        Bytes per cell.
+    error : type
+        Exception to raise.
+
+    Returns
+    -------
+    shape : tuple of int
+        The same shape.
+
+    Raises
+    ------
+    ValueError
+        Or the given ``error``, when the grid is larger than ``MAX_GRID_BYTES`` or the points reach over more than
+        ``MAX_EXTENT_M``; it says how far the points reach and how many of them lie far from the others.
+    """
+    size = n_bytes * float(np.prod(np.asarray(shape, dtype=np.float64)))
+    low, high = points.min(axis=0), points.max(axis=0)
+    if size <= MAX_GRID_BYTES and (high - low <= MAX_EXTENT_M).all():
+        return tuple(int(n) for n in shape)
+    away = np.hypot(*(points - np.median(points, axis=0)).T)
+    n_far, farthest = int(np.sum(away > 10.0 * np.median(away))), points[away.argmax()]
+    need = f"; their grid would take {size / 2**30:,.0f} GiB" if size > MAX_GRID_BYTES else ""
+    raise error(
+        f"{name}: points from x {low[0]:.6g} to {high[0]:.6g} m and y {low[1]:.6g} to {high[1]:.6g} m; {n_far} of"
+        f" {len(points)} lie far from the others, the farthest at ({farthest[0]:.6g}, {farthest[1]:.6g}) m{need}"
+    )
 
 
 def compose(T_a_b: np.ndarray, T_b_c: np.ndarray) -> np.ndarray:

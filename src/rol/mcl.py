@@ -15,9 +15,9 @@ import numpy as np
 from numba import get_num_threads, njit, prange
 
 try:
-    from .geometry import check_fields, check_poses, compose, wrap_angle
+    from .geometry import check_fields, check_grid, check_poses, compose, wrap_angle
 except ImportError:  # this file was copied on its own
-    from geometry import check_fields, check_poses, compose, wrap_angle
+    from geometry import check_fields, check_grid, check_poses, compose, wrap_angle
 
 
 class MclError(ValueError):
@@ -208,14 +208,16 @@ def stamp_grid(
     Raises
     ------
     MclError
-        If the map is empty or not finite.
+        If the map is empty, not finite or too large for a grid, or a length is not above zero.
     """
     map_points = _check_points(map_points, "map")
     if len(map_points) == 0:
         raise MclError("the map holds no point")
+    if not (0.0 < cell < np.inf and 0.0 < reach < np.inf):
+        raise MclError(f"grid of the map: cell {cell} m and reach {reach} m must be above zero")
     origin = np.floor((map_points.min(axis=0) - reach) / cell) * cell
-    shape = np.ceil((map_points.max(axis=0) + reach - origin) / cell).astype(int)
-    values = np.zeros(tuple(shape), dtype=np.uint8)
+    shape = np.ceil((map_points.max(axis=0) + reach - origin) / cell)
+    values = np.zeros(check_grid(shape, map_points, "map", error=MclError), dtype=np.uint8)
     _stamp(values, (map_points - origin) / cell, reach / cell, codes)
     return values, origin
 

@@ -23,9 +23,9 @@ from numba import njit, prange
 from scipy.spatial import cKDTree
 
 try:
-    from ..geometry import check_fields, check_poses, invert, transform_points
+    from ..geometry import check_fields, check_grid, check_poses, invert, transform_points
 except ImportError:  # this file was copied on its own
-    from geometry import check_fields, check_poses, invert, transform_points
+    from geometry import check_fields, check_grid, check_poses, invert, transform_points
 
 KINDS = ("near", "beside", "false")
 
@@ -138,14 +138,18 @@ def look_around(
     Raises
     ------
     MapPointsError
-        If the map is empty.
+        If the map is empty, not finite or too large for a grid.
     """
     map_points, poses = np.asarray(map_points, dtype=np.float64), check_poses(poses)
     if len(map_points) == 0:
         raise MapPointsError("the map holds no point")
+    if not np.isfinite(map_points).all():
+        raise MapPointsError("the map holds a point that is not finite")
     corner = map_points.min(axis=0) - 0.5 * cell
+    shape = np.floor((map_points.max(axis=0) - corner) / cell) + 1
+    shape = check_grid(shape, map_points, "map", error=MapPointsError)
     cells = np.floor((map_points - corner) / cell).astype(np.int64)
-    occupied = np.zeros(cells.max(axis=0) + 1, dtype=np.uint8)
+    occupied = np.zeros(shape, dtype=np.uint8)
     occupied[cells[:, 0], cells[:, 1]] = 1
     places = np.column_stack([(poses[:, :2] - corner) / cell, poses[:, 2]])
     reach, depth = max_range_m / cell, depth_m / cell
