@@ -8,7 +8,7 @@ import nbformat
 import pytest
 
 from chapters import NOTEBOOKS, notebook_parameters, read_notebook, tagged_cells
-from rol.notebook import ParameterError, check_parameters, read_parameters
+from rol.parameters import ParameterError, check_parameters, read_parameters
 
 ROOT = Path(__file__).resolve().parents[1]
 PARAMETERS = """
@@ -118,7 +118,7 @@ def test_every_notebook_checks_its_parameters_first(path: Path, monkeypatch: pyt
     assert read_parameters(path) == notebook_parameters(path)
     code = [cell for cell in read_notebook(path).cells if cell.cell_type == "code"]
     lines = code[1].source.splitlines()
-    assert lines[0] == "from rol.notebook import check_parameters"
+    assert lines[0] == "from rol.parameters import check_parameters"
     call = next(line for line in lines[1:] if line)
     assert call.startswith(f'check_parameters("{path.stem}", globals()')
     monkeypatch.chdir(ROOT)
