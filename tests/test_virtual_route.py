@@ -279,7 +279,7 @@ def test_faulty_route_settings_are_named(small_root: Path, tmp_path: Path, chang
 def test_route_without_real_data_says_how_to_get_them(tmp_path: Path) -> None:
     with pytest.raises(SettingsError, match=r"no real data in .*; run `make real` or set ROL_REAL_ROOT"):
         build_session(load_settings(recipe(tmp_path, tmp_path / "nowhere")), NAME)
-    with pytest.raises(SettingsError, match="neither 'town' nor 'route'"):
+    with pytest.raises(SettingsError, match="world: 'moon' is none of town, route"):
         parse_settings({"world": "moon"})
     with pytest.raises(SettingsError, match="scans: 0 is too few"):
         parse_settings({"sessions": {"virtual-a": {"start": START, "scans": 0}}})
