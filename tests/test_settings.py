@@ -20,8 +20,12 @@ from rol.virtual.map_points import FrontEnd, MapPointsError
 from rol.virtual.radar_sensor import RadarSettings
 from rol.virtual.settings import SessionSettings, SettingsError, VirtualSettings
 
-NEEDED = {"RecoverySettings": {"level": 0.2}, "SessionSettings": {"start": "2019-01-10T11:46:21"}}
-NAMES = ("Settings", "Config", "Rule", "Model", "FrontEnd")
+NEEDED = {
+    "RecoverySettings": {"level": 0.2},
+    "Surface": {"diffuse": 0.1},
+    "SessionSettings": {"start": "2019-01-10T11:46:21"},
+}
+NAMES = ("Settings", "Config", "Rule", "Model", "FrontEnd", "Surface")
 
 
 def settings_classes() -> list[type]:
@@ -60,7 +64,7 @@ def test_the_classes_are_all_there() -> None:
     names = {kind.__name__ for kind in settings_classes()}
     assert names == {
         "FailureRule", "FrontEnd", "LidarSettings", "LocalMapSettings", "MclSettings", "MotionModel",
-        "RadarSettings", "RecoverySettings", "SessionSettings", "TrainConfig", "VirtualSettings",
+        "RadarSettings", "RecoverySettings", "SessionSettings", "Surface", "TrainConfig", "VirtualSettings",
     }  # fmt: skip
 
 
