@@ -7,7 +7,15 @@ from pathlib import Path
 import nbformat
 import pytest
 
-from chapters import NOTEBOOKS, notebook_parameters, read_notebook, tagged_cells
+from chapters import (
+    NOTEBOOKS,
+    all_runs,
+    load_config,
+    notebook_parameters,
+    read_notebook,
+    run_parameters,
+    tagged_cells,
+)
 from rol.parameters import ParameterError, check_parameters, read_parameters
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -142,3 +150,18 @@ def test_papermill_ends_in_the_first_cell(tmp_path: Path) -> None:
     assert len(tagged_cells(executed, "injected-parameters")) == 1
     done = [cell for cell in executed.cells if cell.get("execution_count")]
     assert len(done) == 3  # parameters, those that were passed, and the check
+
+
+@pytest.mark.parametrize("profile", sorted((ROOT / "config").glob("*.yaml")), ids=lambda path: path.stem)
+def test_profiles_pass_what_the_notebooks_accept(profile: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """But for folders and sessions, which only a run has."""
+    config = load_config(profile)
+    monkeypatch.chdir(ROOT)
+    for run in all_runs(config):
+        defaults = read_parameters(NOTEBOOKS / f"{run.chapter}.ipynb")
+        folders = [name for name, value in defaults.items() if isinstance(value, str)]
+        namespace = defaults | run_parameters(config, run)
+        if "session" in namespace:
+            assert isinstance(namespace["session"], str)
+            namespace["session"] = "all"
+        check_parameters(run.chapter, namespace, optional=folders)
