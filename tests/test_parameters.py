@@ -82,13 +82,17 @@ def test_in_the_folder_of_the_notebooks_it_goes_to_the_root(
         ({"sessions": ["one", 2]}, "sessions: in the list: expected text such as 'one', got 2"),
         ({"sessions": []}, "sessions: the list is empty"),
         ({"sede": 3}, r"sede: unknown parameter \(parameters: sessions_root, sessions, "),
-        ({"sessions_root": "/nonexistent"}, "sessions_root: '/nonexistent' does not exist; .*rol.virtual"),
-        ({"in_dir": "build/other"}, "in_dir: 'build/other' does not exist; .*`make book`"),
+        (
+            {"sessions_root": "/nonexistent"},
+            "sessions_root: folder '/nonexistent' does not exist; .*rol.virtual",
+        ),
+        ({"in_dir": "data/weights/net.bin"}, "in_dir: folder 'data/weights/net.bin' does not exist"),
+        ({"in_dir": "build/other"}, "in_dir: folder 'build/other' does not exist; .*`make book`"),
         (
             {"weights": "data/none.bin"},
-            "weights: 'data/none.bin' does not exist; it comes with the repository",
+            "weights: file 'data/none.bin' does not exist; it comes with the repository",
         ),
-        ({"real_root": "/nonexistent"}, "real_root: '/nonexistent' does not exist; `make real`"),
+        ({"real_root": "/nonexistent"}, "real_root: folder '/nonexistent' does not exist; `make real`"),
         ({"session": "three"}, "session: 'three' is none of the sessions one, two"),
         ({"session": "two"}, "session: 'two' is not in data/sessions; there are: one, three"),
         ({"seed": "3", "reach": "far"}, "seed: expected .*; reach: expected"),
@@ -143,7 +147,7 @@ def test_papermill_ends_in_the_first_cell(tmp_path: Path) -> None:
     for words in (
         "ParameterError: notebooks/10_real_radar.ipynb: sede: unknown parameter",
         "seed: expected a whole number such as 1, got '3'",
-        "real_root: '/nonexistent' does not exist",
+        "real_root: folder '/nonexistent' does not exist",
     ):
         assert words in answer.stderr
     executed = read_notebook(tmp_path / "10.ipynb")

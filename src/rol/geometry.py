@@ -97,7 +97,7 @@ def check_fields(
 
 
 def _is_in(value: Any, span: str, is_whole: bool) -> bool:
-    """Say whether a number, or each number of nested tuples, lies in an interval such as "[0, 1)"."""
+    """Check whether a number, or each number of nested tuples, lies in an interval such as "[0, 1)"."""
     values = np.asarray(value)
     if values.dtype.kind not in ("iu" if is_whole else "iuf"):
         return False

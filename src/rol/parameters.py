@@ -23,7 +23,7 @@ WORDS = {
     dict: "a mapping",
 }
 MAKERS = {  # parameter -> how to get what it names
-    "sessions_root": "`python -m rol.virtual config/demo.yaml` makes the demo's sessions",
+    "sessions_root": "`python -m rol.virtual config/demo.yaml --out data/sessions/demo` makes the demo's",
     "in_dir": "the chapters before this one write it, `make book` runs all",
     "real_root": "`make real` gets the real data",
 }
@@ -106,7 +106,7 @@ def read_parameters(path: Path | str) -> dict[str, Any]:
 
 
 def _literal_names(namespace: MutableMapping[str, Any]) -> list[str]:
-    """Names of plain values that a person or papermill has set, without IPython's own."""
+    """List names of plain values that a person or papermill has set, without IPython's own."""
     kinds = (bool, int, float, str, list, dict, tuple, type(None))
     return [
         name
@@ -116,7 +116,7 @@ def _literal_names(namespace: MutableMapping[str, Any]) -> list[str]:
 
 
 def _type_fault(value: Any, default: Any) -> str:
-    """Say what is wrong with the type of a value; empty if nothing is. A whole number will do for any number."""
+    """Describe what is wrong with the type of a value; empty if nothing is. A whole number passes for any number."""
     kind = type(default)
     accepted = (int, float) if kind is float else (kind,)
     if type(value) not in accepted:
@@ -132,15 +132,18 @@ def _type_fault(value: Any, default: Any) -> str:
 
 
 def _path_fault(name: str, value: Any, default: Any) -> str:
-    """Say that a file or folder to read is missing; empty if it is there or the parameter names none."""
+    """Describe a file or folder that is missing; empty if it exists or the parameter names none to read."""
     is_path = isinstance(default, str) and ("/" in default or name.endswith("_root")) and name != "out_dir"
-    if not is_path or (value == default == "") or Path(value).exists():
+    if not is_path or value == default == "":
         return ""
-    return f"{value!r} does not exist; {MAKERS.get(name, FROM_REPOSITORY)}"
+    kind, exists = ("file", Path.is_file) if Path(default).suffix else ("folder", Path.is_dir)
+    return (
+        "" if exists(Path(value)) else f"{kind} {value!r} does not exist; {MAKERS.get(name, FROM_REPOSITORY)}"
+    )
 
 
 def _session_faults(parameters: dict[str, Any]) -> list[str]:
-    """Say that the session is none of the sessions, or has no folder."""
+    """List that the session is none of the sessions, or has no folder."""
     session, root = parameters.get("session", "all"), parameters.get("sessions_root")
     if session == "all" or root is None:
         return []
