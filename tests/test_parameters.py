@@ -84,7 +84,7 @@ def test_in_the_folder_of_the_notebooks_it_goes_to_the_root(
         ({"sede": 3}, r"sede: unknown parameter \(parameters: sessions_root, sessions, "),
         (
             {"sessions_root": "/nonexistent"},
-            "sessions_root: folder '/nonexistent' does not exist; .*rol.virtual",
+            "sessions_root: folder '/nonexistent' does not exist; `make book`",
         ),
         ({"in_dir": "data/weights/net.bin"}, "in_dir: folder 'data/weights/net.bin' does not exist"),
         ({"in_dir": "build/other"}, "in_dir: folder 'build/other' does not exist; .*`make book`"),

@@ -23,7 +23,7 @@ WORDS = {
     dict: "a mapping",
 }
 MAKERS = {  # parameter -> how to get what it names
-    "sessions_root": "`python -m rol.virtual config/demo.yaml --out data/sessions/demo` makes the demo's",
+    "sessions_root": "`make book` makes those of the demo, and book/rerun.md shows how to make one",
     "in_dir": "the chapters before this one write it, `make book` runs all",
     "real_root": "`make real` gets the real data",
 }
