@@ -63,7 +63,7 @@ def test_folder_that_is_not_whole_is_not_taken_for_whole(
         list_fakes(folder)
     with pytest.raises(ValueError, match=f"{STAMPS[2]}.png: missing"):
         finish_fakes(folder, {}, STAMPS, {})
-    (folder / "fake.json").write_text('{"stamps": []}')
+    (folder / "fake.json").write_text('{"stamps": []}', encoding="utf-8")
     with pytest.raises(ValueError, match="fake.json: not a list of fakes"):
         list_fakes(folder)
 

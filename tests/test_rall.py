@@ -28,7 +28,7 @@ def test_real_odometry_follows_the_real_poses(real_root: Path) -> None:
 
 
 def test_real_scan_poses(real_root: Path) -> None:
-    poses = rall.load_scan_poses(real_root / rall.SCAN_POSES_PATH)
+    poses = rall.load_scan_poses(rall.find_scan_poses(real_root))
     assert len(poses) == 11 and min(poses) == 1547131046353776
     np.testing.assert_allclose(poses[1547131046353776], [146.619, -10.956, -0.06091])
 
@@ -48,13 +48,13 @@ def test_real_scans_come_with_pose_and_velocity(real_root: Path, tmp_path: Path)
     for scan in (*scans[:2], scans[-1]):
         (folder / scan.path.name).write_bytes(scan.path.read_bytes())
         lines.append(",".join(map(str, (scan.stamp_us, *scan.pose))))
-    (tmp_path / rall.SCAN_POSES_PATH).write_text("\n".join(lines))
+    (tmp_path / rall.SCAN_POSES_PATH).write_text("\n".join(lines), encoding="utf-8")
     alone = rall.load_scans(tmp_path)
     assert alone[0].twist == pytest.approx(scans[0].twist, abs=0.3) and alone[2].twist is None
 
 
 def test_real_scans_that_are_missing_are_told(tmp_path: Path) -> None:
-    (tmp_path / rall.SCAN_POSES_PATH).write_text("timestamp_us,x_m,y_m,yaw_rad\n1,0,0,0\n")
+    (tmp_path / rall.SCAN_POSES_PATH).write_text("timestamp_us,x_m,y_m,yaw_rad\n1,0,0,0\n", encoding="utf-8")
     with pytest.raises(rall.RallError, match="holds none of the 1 scans"):
         rall.load_scans(tmp_path)
 
@@ -84,13 +84,29 @@ def test_find_real_root(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None
     monkeypatch.chdir(tmp_path)
     monkeypatch.delenv("ROL_REAL_ROOT", raising=False)
     assert rall.find_real_root() is None and rall.find_real_root(tmp_path) is None
+    with pytest.raises(rall.RallError, match="real_root: there is no folder .*elsewhere"):
+        rall.find_real_root(tmp_path / "elsewhere")
     path = tmp_path / "here" / rall.MAP_PATH
     path.parent.mkdir(parents=True)
     path.write_bytes(b"")
     assert rall.find_real_root(tmp_path / "here") == tmp_path / "here"
     monkeypatch.setenv("ROL_REAL_ROOT", str(tmp_path / "here"))
     assert rall.find_real_root() == tmp_path / "here"
-    assert rall.find_real_root(tmp_path / "elsewhere") is None  # what is asked for by name is not replaced
+    assert rall.find_real_root(tmp_path) is None  # what is asked for by name is not replaced
+    (tmp_path / "data").mkdir()
+    (tmp_path / "data" / "real").symlink_to(tmp_path / "here")
+    monkeypatch.setenv("ROL_REAL_ROOT", str(tmp_path))
+    assert rall.find_real_root() is None
+    monkeypatch.delenv("ROL_REAL_ROOT")
+    assert rall.find_real_root() == Path("data/real")
+
+
+def test_scan_poses_come_with_the_project(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(Path(__file__).parents[1])
+    shipped = rall.find_scan_poses(tmp_path)
+    assert len(rall.load_scan_poses(shipped)) == 11
+    (tmp_path / rall.SCAN_POSES_PATH).write_text("timestamp_us,x_m,y_m,yaw_rad\n1,0,0,0\n")
+    assert list(rall.load_scan_poses(rall.find_scan_poses(tmp_path))) == [1]
 
 
 def test_map_cells_lie_where_the_readme_says(tmp_path: Path) -> None:
@@ -115,7 +131,7 @@ def test_map_cells_lie_where_the_readme_says(tmp_path: Path) -> None:
 def test_faulty_poses_are_named(tmp_path: Path, content: str | None, fault: str) -> None:
     path = tmp_path / "pose_xy_03.txt"
     if content is not None:
-        path.write_text(content)
+        path.write_text(content, encoding="utf-8")
     with pytest.raises(rall.RallError, match=f"pose_xy_03.txt: .*{fault}"):
         rall.load_poses(path)
 
@@ -140,6 +156,6 @@ def test_faulty_maps_and_scan_poses_are_named(tmp_path: Path) -> None:
     with pytest.raises(rall.RallError, match=r"poses.csv: missing"):
         rall.load_scan_poses(table)
     for row, fault in (("12,1.0,2.0,nan", "all finite"), ("noon,1,2,3", "line 2")):
-        table.write_text(f"timestamp_us,x_m,y_m,yaw_rad\n{row}\n")
+        table.write_text(f"timestamp_us,x_m,y_m,yaw_rad\n{row}\n", encoding="utf-8")
         with pytest.raises(rall.RallError, match=fault):
             rall.load_scan_poses(table)

@@ -8,9 +8,7 @@ from __future__ import annotations
 
 import base64
 import datetime
-import importlib.metadata
 import os
-import platform
 import re
 import shutil
 import subprocess
@@ -22,6 +20,7 @@ from urllib.parse import urlsplit
 import nbformat
 import yaml
 
+import check
 from chapters import (
     CHAPTERS,
     NOTEBOOKS,
@@ -34,9 +33,9 @@ from chapters import (
     load_run,
     tagged_cells,
 )
+from rol.files import read_text, write_text
 from toolbox_pages import stage_toolbox
 
-VERSIONS_SHOWN = "numpy scipy opencv-python-headless numba pandas torch open3d-cpu matplotlib papermill snakemake jupyter-book"
 FIGURE_DATA = ("session", "real", "simulated", "both")  # what a figure shows
 GLUED_KIND = "{glue:text}`kind`"
 # The picture of the first page is taken from a run: the first of these that there is, and what the page says of it.
@@ -274,7 +273,7 @@ def stage_settings(book: Path, environment: Mapping[str, str]) -> None:
     more = launch_settings(environment)
     if more:
         path = book / "_config.yml"
-        path.write_text(yaml.safe_dump(yaml.safe_load(path.read_text()) | more, sort_keys=False))
+        write_text(path, yaml.safe_dump(yaml.safe_load(read_text(path)) | more, sort_keys=False))
 
 
 # ---- generated pages ------------------------------------------------------------------------------------------
@@ -282,63 +281,103 @@ def stage_settings(book: Path, environment: Mapping[str, str]) -> None:
 
 def git(*words: str) -> str:
     """Ask git, without minding when there is no repository."""
-    answer = subprocess.run(["git", *words], cwd=ROOT, capture_output=True, text=True, check=False)
+    answer = subprocess.run(["git", *words], cwd=ROOT, capture_output=True, encoding="utf-8", check=False)
     return answer.stdout.strip() if answer.returncode == 0 else ""
+
+
+def commit() -> str:
+    """Name the commit of the working tree, where git knows it."""
+    known = git("rev-parse", "HEAD") or "not known (no git repository)"
+    changed = git("status", "--porcelain", "--untracked-files=no")
+    return known + (", with changes that are not committed" if changed else "")
+
+
+def markdown_table(header: list[str], lines: list[list[str]]) -> str:
+    """Write a table in Markdown."""
+    cells = [header, ["---"] * len(header), *lines]
+    return "\n".join("| " + " | ".join(cell.replace("|", r"\|") for cell in line) + " |" for line in cells)
+
+
+def reproduced_page(config: dict) -> str:
+    """Fill the page that compares this build with the reference; without a reference its tables are empty."""
+    has_reference = (check.REFERENCE / f"{config['profile']}.json").is_file()
+    rows = check.compare_build(config) if has_reference else []
+    made_on = check.read_reference(config["profile"])["machine"] if has_reference else {}
+    tables = []
+    for chapter in sorted({row.entry["chapter"] for row in rows}):
+        lines = [
+            [*row.cells(), f"{row.entry['kind']}: {row.entry['reason']}"]
+            for row in rows
+            if row.entry["chapter"] == chapter
+        ]
+        header = ["number", "reference", "this build", "tolerance", "result", "depends on"]
+        title = f"### [Chapter {int(chapter[:2])}](notebooks/{chapter}.ipynb)"
+        tables.append(f"{title}\n\n{markdown_table(header, lines)}")
+    counts = [[result, str(n)] for result, n in [*check.count_results(rows).items(), ("all", len(rows))]]
+    here = check.machine() | {"Commit": commit()}
+    parts = {
+        "counts": markdown_table(["result", "numbers"], counts),
+        "numbers": "\n\n".join(tables),
+        "machine": markdown_table(
+            ["what", "reference", "this build"], [[k, made_on.get(k, ""), v] for k, v in here.items()]
+        ),
+    }
+    text = read_text(check.PAGE)
+    for name, part in parts.items():
+        text = text.replace(f"{{{{ {name} }}}}", part)
+    return text
 
 
 def how_made_page(config: dict, config_path: str) -> str:
     """Write the page that says when, from what, with what and in what time the book was made."""
-    commit = git("rev-parse", "HEAD") or "not known (no git repository)"
-    if git("status", "--porcelain", "--untracked-files=no"):
-        commit += ", with changes that are not committed"
     rows = [
-        ("Made", datetime.datetime.now(datetime.UTC).strftime("%Y-%m-%d %H:%M UTC")),
-        ("Commit", commit),
-        ("Profile", f"`{config_path}`"),
-        ("Machine", f"{platform.system()} {platform.machine()}, Python {platform.python_version()}"),
-        *((name, importlib.metadata.version(name)) for name in VERSIONS_SHOWN.split() if installed(name)),
+        ["Made", datetime.datetime.now(datetime.UTC).strftime("%Y-%m-%d %H:%M UTC")],
+        ["Commit", commit()],
+        ["Profile", f"`{config_path}`"],
+        *([name, value] for name, value in check.machine().items()),
     ]
-    lines = [
+    times = [
+        [run.chapter, run.session, run.method, f"{metadata.papermill.duration:.0f}"]
+        for run in all_runs(config)
+        for metadata in [nbformat.read(run.path(config["out_dir"]), as_version=4).metadata]
+    ]
+    parts = [
         "# How this book was made",
-        "",
-        "| what | |",
-        "|---|---|",
-        *(f"| {k} | {v} |" for k, v in rows),
-        "",
-    ]
-    lines += [
+        markdown_table(["what", "this build"], rows),
         "## Time that each chapter took",
-        "",
-        "| chapter | session | method | s |",
-        "|---|---|---|---:|",
+        markdown_table(["chapter", "session", "method", "s"], times),
+        "## The profile",
+        f"```yaml\n{read_text(config_path).strip()}\n```",
     ]
-    for run in all_runs(config):
-        metadata = nbformat.read(run.path(config["out_dir"]), as_version=4).metadata
-        lines.append(f"| {run.chapter} | {run.session} | {run.method} | {metadata.papermill.duration:.0f} |")
-    lines += ["", "## The profile", "", "```yaml", Path(config_path).read_text().strip(), "```", ""]
-    return "\n".join(lines)
+    return "\n\n".join(parts) + "\n"
 
 
-def installed(name: str) -> bool:
-    """Say whether a distribution is installed."""
-    return bool(list(importlib.metadata.distributions(name=name)))
+def clear(book: Path) -> None:
+    """Remove a staged book; refuse a folder that holds files and is not a staged book."""
+    if not (book / "made.md").is_file() and any(path.is_file() for path in book.rglob("*")):
+        raise ChapterError(
+            f"book_dir: {book}: holds files but no made.md, so it is no staged book; left alone"
+        )
+    shutil.rmtree(book, ignore_errors=True)
+    write_text(book / "made.md", "")
 
 
 def stage(config_path: str) -> Path:
     """Stage the whole book of a profile and give its folder."""
     config = load_config(config_path)
     book = Path(config["book_dir"])
-    shutil.rmtree(book, ignore_errors=True)
-    shutil.copytree(ROOT / "book", book)
+    clear(book)
+    shutil.copytree(ROOT / "book", book, ignore=shutil.ignore_patterns("._*"), dirs_exist_ok=True)
     stage_notebooks(config, book)
     stage_result_figure(config, book)
     modules = stage_toolbox(book)
-    (book / "made.md").write_text(how_made_page(config, config_path))
+    write_text(book / "made.md", how_made_page(config, config_path))
+    write_text(book / "did_it_reproduce.md", reproduced_page(config))
     pages = book_pages(config)
     for page in book.glob("*.md"):
-        page.write_text(point_to_pages(page.read_text(), pages))
-    contents = expand_contents(yaml.safe_load((book / "_toc.yml").read_text()), pages, modules)
-    (book / "_toc.yml").write_text(yaml.safe_dump(contents, sort_keys=False))
+        write_text(page, point_to_pages(read_text(page), pages))
+    contents = expand_contents(yaml.safe_load(read_text(book / "_toc.yml")), pages, modules)
+    write_text(book / "_toc.yml", yaml.safe_dump(contents, sort_keys=False))
     stage_settings(book, os.environ)
     return book
 

@@ -8,7 +8,6 @@ Images are uint8 (h, w), 0 empty to 255 occupied, row 0 farthest forward, column
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -16,14 +15,19 @@ from typing import TYPE_CHECKING, Any
 import cv2
 import numpy as np
 
+try:
+    from .files import prepare_images, read_text, write_bytes, write_text
+except ImportError:  # this file was copied on its own
+    from files import prepare_images, read_text, write_bytes, write_text
+
 if TYPE_CHECKING:
     from .pix2pix import ResnetGenerator
 
 
 def prepare_fakes(folder: str | Path, settings: dict[str, Any]) -> set[int]:
-    """Make a folder ready for fakes of these settings and tell which ones it already holds.
+    """Prepare a folder for generated images of these settings and list those it already holds.
 
-    Fakes made with other settings are removed.
+    Images made with other settings are removed.
 
     Parameters
     ----------
@@ -35,17 +39,14 @@ def prepare_fakes(folder: str | Path, settings: dict[str, Any]) -> set[int]:
     Returns
     -------
     stamps_us : set of int
-        Radar stamps of the fakes that are there [us].
+        Radar stamps of the images that are there [us].
+
+    Raises
+    ------
+    ValueError
+        If the folder is not empty and was not prepared by this function; nothing is removed.
     """
-    folder = Path(folder)
-    folder.mkdir(parents=True, exist_ok=True)
-    (folder / "fake.json").unlink(missing_ok=True)
-    marker, text = folder / "settings.json", json.dumps(settings, indent=1, sort_keys=True)
-    if not marker.is_file() or marker.read_text() != text:
-        for path in folder.glob("*.png"):
-            path.unlink()
-        _write_bytes(marker, text.encode())
-    return {int(path.stem) for path in folder.glob("*.png") if path.stem.isdigit()}
+    return prepare_images(folder, settings, (".",), "fake.json")
 
 
 def write_fakes(
@@ -73,7 +74,7 @@ def write_fakes(
 
     for stamp in stamps_us:
         fake = generate(generator, read_image(Path(pairs) / "radar" / f"{int(stamp)}.png"))
-        _write_bytes(Path(folder) / f"{int(stamp)}.png", cv2.imencode(".png", fake)[1].tobytes())
+        write_bytes(Path(folder) / f"{int(stamp)}.png", cv2.imencode(".png", fake)[1].tobytes())
         yield int(stamp)
 
 
@@ -104,7 +105,7 @@ def finish_fakes(
             raise ValueError(f"{path}: missing, the fakes are not complete")
     stamps = [int(stamp) for stamp in stamps_us]
     about = {"settings": settings, "points": points, "stamps_us": stamps}
-    _write_bytes(Path(folder) / "fake.json", json.dumps(about, indent=1, sort_keys=True).encode())
+    write_text(Path(folder) / "fake.json", json.dumps(about, indent=1, sort_keys=True))
 
 
 def list_fakes(folder: str | Path) -> tuple[list[int], dict[str, Any]]:
@@ -131,7 +132,7 @@ def list_fakes(folder: str | Path) -> tuple[list[int], dict[str, Any]]:
     if not path.is_file():
         raise ValueError(f"{path}: missing; chapter 05 writes it when all fakes of the session are there")
     try:
-        about = json.loads(path.read_text())
+        about = json.loads(read_text(path))
         return [int(stamp) for stamp in about["stamps_us"]], dict(about["points"])
     except (ValueError, KeyError, TypeError) as error:
         raise ValueError(f"{path}: not a list of fakes ({error})") from error
@@ -163,10 +164,3 @@ def read_image(path: str | Path) -> np.ndarray:
     if image is None or image.ndim != 2 or image.dtype != np.uint8:
         raise ValueError(f"{path}: not a readable grey image of 8 bits")
     return image
-
-
-def _write_bytes(path: Path, data: bytes) -> None:
-    """Write a file under a temporary name in its folder, then rename it."""
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    temporary.write_bytes(data)
-    os.replace(temporary, path)

@@ -7,7 +7,7 @@ onto the session's poses, gives them in the first map's frame.
 
 from __future__ import annotations
 
-import os
+import io
 import zipfile
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -17,9 +17,14 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 try:
+    from .files import write_bytes
     from .geometry import check_grid, check_poses, compose, transform_points
 except ImportError:  # this file was copied on its own
+    from files import write_bytes
     from geometry import check_grid, check_poses, compose, transform_points
+
+
+_WAITING_POINTS = 50_000  # so many points are added to a map at once
 
 
 class MapError(ValueError):
@@ -75,21 +80,40 @@ def accumulate_map(
         If there are more or fewer clouds than poses, a point is not finite, or no cell is left. Yin et al.
         2020, Sec. IV-A.
     """
-    poses, thinned = check_poses(poses), []
+    poses, n_clouds, waiting, n_waiting = check_poses(poses), 0, [], 0
+    cells = np.array([np.iinfo(np.int64).max]), np.zeros((1, 2)), np.zeros(1, dtype=np.int64)  # an end mark
     for i, cloud in enumerate(clouds):
         if i >= len(poses):
             raise MapError(f"more clouds than the {len(poses)} poses")
         if not np.isfinite(cloud).all():
             raise MapError(f"cloud {i} holds a point that is not finite")
-        thinned.append(thin_points(transform_points(poses[i], np.reshape(cloud, (-1, 2))), cell)[0])
-    if len(thinned) != len(poses):
-        raise MapError(f"{len(thinned)} clouds for {len(poses)} poses")
-    points = np.concatenate(thinned) if thinned else np.zeros((0, 2))
-    _, inverse, hits = _unique_cells(points, cell)
-    if not (hits >= min_hits).any():
+        waiting.append(thin_points(transform_points(poses[i], np.reshape(cloud, (-1, 2))), cell)[0])
+        n_clouds, n_waiting = n_clouds + 1, n_waiting + len(waiting[-1])
+        if n_waiting > _WAITING_POINTS:  # memory grows with the map, not with the clouds
+            cells, waiting, n_waiting = _add_points(*cells, np.concatenate(waiting), cell), [], 0
+    if n_clouds != len(poses):
+        raise MapError(f"{n_clouds} clouds for {len(poses)} poses")
+    _, sums, hits = _add_points(*cells, np.concatenate([np.zeros((0, 2)), *waiting]), cell)
+    is_kept = hits >= max(min_hits, 1)
+    if not is_kept.any():
         raise MapError(f"the map is empty: no cell is hit by {min_hits} of {len(poses)} clouds")
-    sums = np.stack([np.bincount(inverse, points[:, k], len(hits)) for k in range(2)], axis=1)
-    return (sums / hits[:, None])[hits >= min_hits]
+    return sums[is_kept] / hits[is_kept, None]
+
+
+def _add_points(
+    keys: np.ndarray, sums: np.ndarray, hits: np.ndarray, points: np.ndarray, cell: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Add points to the sums and numbers of points of their cells, which are sorted by key; the last is an end mark."""
+    indices = np.floor(points / cell).astype(np.int64)
+    own = (indices[:, 0] << 32) + indices[:, 1]
+    found = np.unique(own)
+    at = np.searchsorted(keys, found)
+    at, new = at[keys[at] != found], found[keys[at] != found]
+    keys, sums, hits = np.insert(keys, at, new), np.insert(sums, at, 0.0, axis=0), np.insert(hits, at, 0)
+    places = np.searchsorted(keys, own)
+    np.add.at(sums, places, points)
+    np.add.at(hits, places, 1)
+    return keys, sums, hits
 
 
 @dataclass(frozen=True)
@@ -246,12 +270,10 @@ def save_map(path: Path | str, points: np.ndarray, T_map_session: np.ndarray) ->
     MapError
         If there is no point, a value is not finite, or the map reaches over more than 100 km.
     """
-    path = Path(path)
     _check_map(path, points, T_map_session)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.npz")
-    np.savez_compressed(temporary, points=points, T_map_session=np.asarray(T_map_session, dtype=np.float64))
-    os.replace(temporary, path)
+    content = io.BytesIO()
+    np.savez_compressed(content, points=points, T_map_session=np.asarray(T_map_session, dtype=np.float64))
+    write_bytes(path, content.getvalue())
 
 
 def load_map(path: Path | str) -> tuple[np.ndarray, np.ndarray]:

@@ -127,7 +127,7 @@ class VirtualSettings:
     world : str
         "town": a town drawn from the seed; "route": the world of the real lidar map, driven along real poses.
     real_root : str
-        World "route" only: folder of the real data; empty: the usual places, see `rall.find_real_root`.
+        World "route" only: folder of the real data; may be empty, see `rall.find_real_root`.
     unmapped_share : float
         World "route" only: things that the map does not show, as a share of the groups of cells that it shows.
     lidar, radar : dict
@@ -229,9 +229,11 @@ def load_settings(path: Path | str) -> VirtualSettings:
     """
     import yaml
 
+    from ..files import read_text
+
     try:
-        content = yaml.safe_load(Path(path).read_text(encoding="utf-8"))
-    except (OSError, yaml.YAMLError) as error:
+        content = yaml.safe_load(read_text(path))
+    except (OSError, ValueError, yaml.YAMLError) as error:
         raise SettingsError(f"{path}: cannot be read: {error}") from error
     if not isinstance(content, Mapping) or "virtual" not in content:
         raise SettingsError(f"{path}: no section 'virtual'")
@@ -256,9 +258,11 @@ def read_settings(path: Path | str) -> VirtualSettings:
     SettingsError
         If the file cannot be read or a setting is at fault.
     """
+    from ..files import read_text
+
     path = Path(path)
     try:
-        values = json.loads(path.read_text(encoding="utf-8"))
+        values = json.loads(read_text(path))
         shared = {key: value for key, value in values.items() if key not in ("format", "session")}
         section = {**shared, "sessions": {path.absolute().parent.name: values["session"]}}
     except (OSError, ValueError, AttributeError, KeyError) as error:
