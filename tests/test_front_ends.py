@@ -54,6 +54,17 @@ def test_unknown_detectors_are_refused() -> None:
         detect_points(scan_with_spot(0.0, 9.0), AZIMUTHS, detector="best")
 
 
+@pytest.mark.parametrize("detector", front_ends.DETECTORS)
+def test_detectors_refuse_scans_that_are_turned_or_no_codes(detector: str) -> None:
+    codes, own = scan_with_spot(0.0, 9.0)[:, :576], {"detector": detector, "range_resolution": 0.17}
+    with pytest.raises(ValueError, match="the codes are transposed"):
+        detect_points(codes.T, AZIMUTHS, **own)
+    with pytest.raises(ValueError, match="azimuths must decrease"):
+        detect_points(codes, -AZIMUTHS, **own)
+    with pytest.raises(ValueError, match="power codes 0..255"):
+        detect_points(codes / 255, AZIMUTHS, **own)
+
+
 def test_shares_on_a_map_by_hand() -> None:
     pose = np.array([100.0, 50.0, np.pi / 2])  # forward is along y of the map
     points = np.array([[10.0, 0.0], [10.0, 1.5], [20.0, 0.0], [30.0, 0.0]])

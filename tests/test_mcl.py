@@ -161,8 +161,8 @@ def test_settings_by_name():
     assert mcl.settings_for("paper", n_particles=7).n_particles == 7
     with pytest.raises(mcl.MclError, match="unknown method 'amcl'; there are paper, rol"):
         mcl.settings_for("amcl")
-    with pytest.raises(mcl.MclError, match="unknown likelihood 'beam'"):
-        mcl.build_grid(CLOUD, mcl.MclSettings(likelihood="beam"))
+    with pytest.raises(mcl.MclError, match="likelihood: 'beam' is none of count, distance"):
+        mcl.MclSettings(likelihood="beam")
 
 
 @pytest.mark.parametrize(

@@ -12,6 +12,7 @@ from rol.radar import (
     doppler_shift,
     find_peaks,
     k_strongest_peaks,
+    peaks_to_points,
     polar_to_cartesian,
     row_seconds,
     twist_to_pose,
@@ -64,6 +65,66 @@ def test_agrees_with_slow_loop_on_a_real_scan(real_root):
     fast = polar_to_cartesian(codes, azimuths, pixel_size=1.0, width=96)
     slow = slow_polar_to_cartesian(codes, -azimuths, 0.0432, 1.0, 96)
     np.testing.assert_allclose(fast, slow, atol=2e-4)
+
+
+def measured_bearing(image):
+    """Bearing of the image's weighted mean [deg]."""
+    forward, left = centroid(image)
+    return math.degrees(math.atan2(left, forward))
+
+
+def shifted(counts):
+    """Azimuths of a scan that begins ahead, some rows a number of encoder counts farther on."""
+    azimuths = -2.0 * np.pi * np.arange(400) * 14 / 5600.0
+    for row, n in counts.items():
+        azimuths[row] -= 2.0 * np.pi * n / 5600.0
+    return azimuths
+
+
+@pytest.mark.parametrize(
+    "azimuths",
+    [
+        shifted({1: 1}),
+        shifted({1: -1}),
+        shifted({0: 3}),
+        shifted({399: 4}),
+        shifted({299: 5, 300: 5, 301: 5}),
+        shifted({row: n for row, n in enumerate(np.random.default_rng(1).integers(-3, 4, 400))}),
+        shifted({}) + 2.0,
+    ],
+)
+@pytest.mark.parametrize("twist", [None, (0.0, 0.0, 0.0)])
+def test_image_and_peaks_agree_on_the_bearing(azimuths, twist):
+    for row in (0, 1, 150, 300, 399):
+        codes = np.zeros((400, 700), dtype=np.uint8)
+        codes[row, 595:606] = 200 - 30 * np.abs(np.arange(-5, 6))
+        codes[[row - 1, (row + 1) % 400]] = codes[row] // 2
+        image = polar_to_cartesian(codes, azimuths, range_resolution=0.05, width=256, twist=twist)
+        x, y = k_strongest_peaks(codes, azimuths, 1, 200, range_resolution=0.05)[0]
+        off = measured_bearing(image) - math.degrees(math.atan2(y, x))
+        assert (
+            abs((off + 180.0) % 360.0 - 180.0) < 0.35
+        )  # steps of 0.9 deg; each side reaches to its own neighbour
+
+
+def test_even_azimuths_need_no_table():
+    for azimuths in (AZIMUTHS, AZIMUTHS + 2.0, shifted({})):
+        assert radar._row_table(azimuths, STEP) is None
+    assert radar._row_table(shifted({1: 1}), STEP) is not None
+
+
+@pytest.mark.parametrize("rows", [np.r_[0:100], np.r_[-50:50], np.r_[0:100, 200:400]])
+def test_nothing_is_shown_where_nothing_was_measured(rows):
+    """A sector to the right, a sector ahead, a turn with a hole."""
+    codes = np.full((len(rows), 700), 200, dtype=np.uint8)
+    image = polar_to_cartesian(codes, -rows * STEP, range_resolution=0.05, width=101)
+    x, y = 50 - np.indices(image.shape)
+    numbers = np.degrees(np.arctan2(-y, x)) % 360.0 / 0.9
+    is_seen = np.isin(numbers.astype(int), rows % 400)
+    is_edge = np.abs(numbers[..., None] - [0, 50, 100, 200, 350, 400]).min(axis=-1) < 2.0
+    is_sure = (np.hypot(x, y) > 5) & ~is_edge
+    np.testing.assert_allclose(image[is_sure & is_seen], 200 / 255, atol=1e-6)
+    assert image[is_sure & ~is_seen].max() == 0.0
 
 
 def test_without_crossover_the_seam_fades():
@@ -243,20 +304,39 @@ def test_real_peaks_lie_on_the_real_map(real_root):
     assert np.mean(near < 1.0) > 0.45
 
 
+SCAN = np.zeros((400, 10), dtype=np.uint8)
+
+
 @pytest.mark.parametrize(
     ("codes", "azimuths", "fault"),
     [
-        (np.zeros((400, 10)), AZIMUTHS[:-1], "expected codes"),
-        (np.zeros(400), AZIMUTHS, "expected codes"),
-        (np.zeros((400, 10)), np.zeros(400), "decrease"),
-        (np.zeros((400, 10)), -AZIMUTHS, "decrease"),
+        (SCAN, AZIMUTHS[:-1], "expected codes"),
+        (SCAN[0], AZIMUTHS, "expected codes"),
+        (np.zeros((10, 400), dtype=np.uint8), AZIMUTHS, "the codes are transposed"),
+        (SCAN / 255, AZIMUTHS, "power codes 0..255 .* as uint8, got float64"),
+        (SCAN.astype(np.int16), AZIMUTHS, "as uint8, got int16"),
+        (SCAN, np.zeros(400), "decrease"),
+        (SCAN, -AZIMUTHS, "azimuths must decrease .*, row 1 does not"),
+        (SCAN, np.where(np.arange(400) == 7, np.nan, AZIMUTHS), "row 7 does not"),
+        (SCAN, 2.0 * AZIMUTHS, "within one turn, they decrease by 718.2 deg"),
     ],
 )
 def test_refuses_bad_scans(codes, azimuths, fault):
-    with pytest.raises(ValueError, match=fault):
-        polar_to_cartesian(codes, azimuths)
-    with pytest.raises(ValueError, match=fault):
-        k_strongest_peaks(codes, azimuths)
+    for function in (polar_to_cartesian, k_strongest_peaks, radar.check_scan):
+        with pytest.raises(ValueError, match=fault):
+            function(codes, azimuths)
+
+
+@pytest.mark.parametrize("find", [find_peaks, lambda codes: cfar_peaks(codes, guard_bins=1, train_bins=1)])
+@pytest.mark.parametrize("codes", [SCAN / 255, SCAN.astype(np.int64), SCAN[0]])
+def test_detectors_refuse_what_is_no_power_code(find, codes):
+    with pytest.raises(ValueError, match="power codes 0..255"):
+        find(codes)
+
+
+def test_peaks_refuse_azimuths_that_rise():
+    with pytest.raises(ValueError, match="azimuths must decrease"):
+        peaks_to_points(np.array([1]), np.array([1]), -AZIMUTHS)
 
 
 def test_constants():

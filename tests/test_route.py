@@ -1,5 +1,6 @@
 """Sessions of the real route: their parts must belong together; how a recovery is judged; drawn points at real poses."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
@@ -26,7 +27,15 @@ from rol.route import (
     run_registration,
 )
 from rol.virtual.map_points import FrontEnd
-from rol.virtual.route_runs import Stage, add_outliers, draw_session, kidnap, run_method, set_stage
+from rol.virtual.route_runs import (
+    Stage,
+    add_outliers,
+    draw_session,
+    kidnap,
+    run_method,
+    set_stage,
+    start_anywhere,
+)
 
 MAP = np.array([[0.0, 0.0], [100.0, 100.0]])
 MAP_ALL = np.array([[-2000.0, -2000.0], [2000.0, 2000.0]])  # holds any route
@@ -158,6 +167,15 @@ def test_registration_is_set_back_to_the_truth_after_a_failure(street: tuple) ->
         if k < 39:
             off = pose_errors(run.poses[k + 1 : k + 2], route.truth[k + 1 : k + 2]).position_m[0]
             assert off < 1.0 and pose_errors(run.poses[k : k + 1], route.truth[k : k + 1]).position_m[0] > 3.0
+
+
+@pytest.mark.parametrize("begin", [kidnap, start_anywhere])
+@pytest.mark.parametrize("first", [-20, 40])
+def test_a_start_at_no_scan_of_the_session_is_refused(street: tuple, begin: Callable, first: int) -> None:
+    route, posts, _ = street
+    stage = Stage(route, posts, FrontEnd(), None, None, MotionModel(), "", 0.2, None)
+    with pytest.raises(ValueError, match=f"first: {first} is no scan of session .*, which has 40"):
+        begin(stage, first, 1)
 
 
 def test_a_run_takes_the_registration_and_another_watch(street: tuple) -> None:

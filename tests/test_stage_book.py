@@ -3,6 +3,7 @@
 import base64
 import importlib.util
 import itertools
+import re
 import shutil
 import sys
 from pathlib import Path
@@ -307,3 +308,53 @@ def test_every_chapter_has_a_figure_that_opens_it() -> None:
         for metadata in opening:
             assert metadata["mystnb"]["figure"]["name"] and metadata["mystnb"]["image"]["alt"]
             assert not metadata["opening"].rstrip().endswith(".")  # the reference to the figure follows
+
+
+# ---- captions -------------------------------------------------------------------------------------------------
+
+WORDS = {"real": r"\breal\b", "simulated": r"\b(simulated|virtual)\b"}
+
+
+def figure_cell(caption: str, **metadata: str) -> nbformat.NotebookNode:
+    """A cell with a figure that shows nothing."""
+    metadata["mystnb"] = {"figure": {"name": "fig-a", "caption": caption}}
+    return nbformat.v4.new_code_cell("", metadata=metadata)
+
+
+@pytest.mark.parametrize(
+    ("caption", "data", "completed"),
+    [
+        ("Errors.", "session", "Errors. Real data."),
+        ("Errors ({glue:text}`kind` data).", "session", "Errors ({glue:text}`kind` data)."),
+        ("Errors of real RADIATE pairs.", "real", "Errors of real RADIATE pairs."),
+        ("Errors on the virtual route.", "simulated", "Errors on the virtual route."),
+        ("Real and virtual.", "both", "Real and virtual."),
+    ],
+)
+def test_only_captions_of_the_sessions_are_completed(caption: str, data: str, completed: str) -> None:
+    notebook = nbformat.v4.new_notebook(cells=[figure_cell(caption, data=data)])
+    stage_book.complete_captions(notebook, "Real")
+    assert notebook.cells[0].metadata.mystnb.figure.caption == completed
+
+
+@pytest.mark.parametrize("metadata", [{}, {"data": "virtual"}])
+def test_figure_that_does_not_state_its_data_is_refused(metadata: dict) -> None:
+    notebook = nbformat.v4.new_notebook(cells=[figure_cell("Errors.", **metadata)])
+    with pytest.raises(ChapterError, match="figure fig-a: `data` .* none of session, real, simulated, both"):
+        stage_book.complete_captions(notebook, "Real")
+
+
+@pytest.mark.parametrize("chapter", CHAPTERS)
+def test_every_caption_names_the_data_of_its_figure(chapter: str) -> None:
+    notebook = nbformat.read(NOTEBOOKS / f"{chapter}.ipynb", as_version=4)
+    stage_book.complete_captions(notebook, "Virtual")
+    for cell in notebook.cells:
+        figure = cell.metadata.get("mystnb", {}).get("figure", {})
+        if "caption" in figure:
+            data, caption = cell.metadata["data"], figure["caption"]
+            is_said = {name: bool(re.search(word, caption, re.IGNORECASE)) for name, word in WORDS.items()}
+            if data == "session":
+                assert (stage_book.GLUED_KIND in caption) != caption.endswith(" Virtual data."), caption
+            else:
+                assert all(is_said.values()) if data == "both" else is_said[data], caption
+                assert not caption.endswith((" Virtual data.", " Real data.")), caption

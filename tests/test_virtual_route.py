@@ -281,7 +281,7 @@ def test_route_without_real_data_says_how_to_get_them(tmp_path: Path) -> None:
         build_session(load_settings(recipe(tmp_path, tmp_path)), NAME)
     with pytest.raises(rall.RallError, match="real_root: there is no folder .*nowhere"):
         build_session(load_settings(recipe(tmp_path, tmp_path / "nowhere")), NAME)
-    with pytest.raises(SettingsError, match="neither 'town' nor 'route'"):
+    with pytest.raises(SettingsError, match="world: 'moon' is none of town, route"):
         parse_settings({"world": "moon"})
     with pytest.raises(SettingsError, match="scans: 0 is too few"):
         parse_settings({"sessions": {"virtual-a": {"start": START, "scans": 0}}})

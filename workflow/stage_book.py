@@ -36,6 +36,8 @@ from chapters import (
 from rol.files import read_text, write_text
 from toolbox_pages import stage_toolbox
 
+FIGURE_DATA = ("session", "real", "simulated", "both")  # what a figure shows
+GLUED_KIND = "{glue:text}`kind`"
 # The picture of the first page is taken from a run: the first of these that there is, and what the page says of it.
 RESULT_FIGURES = (
     ("10_real_radar", "fig-story", "real.md"),
@@ -88,14 +90,22 @@ def number_title(notebook: nbformat.NotebookNode, page: str) -> None:
 
 
 def complete_captions(notebook: nbformat.NotebookNode, kind: str) -> None:
-    """Let every caption say what data it shows, virtual or real, where it does not say so itself (in place)."""
+    """Add to the captions of figures that show the sessions whether those are virtual or real (in place).
+
+    The metadata of every figure's cell state in `data` what the figure shows. Only "session" depends on the profile;
+    the captions of the others name their data themselves, as do those that glue in the `kind`.
+    """
     for cell in notebook.cells:
         figure = cell.metadata.get("mystnb", {}).get("figure", {})
-        if "caption" in figure and not re.search(
-            r"\b(virtual|real (data|scan|session|route|car))|\{glue:text\}`kind`",
-            figure["caption"],
-            re.IGNORECASE,
-        ):
+        if "caption" not in figure:
+            continue
+        data = cell.metadata.get("data")
+        if data not in FIGURE_DATA:
+            raise ChapterError(
+                f"figure {figure.get('name')}: `data` in the metadata of its cell is {data!r},"
+                f" none of {', '.join(FIGURE_DATA)}"
+            )
+        if data == "session" and GLUED_KIND not in figure["caption"]:
             figure["caption"] = f"{figure['caption'].strip()} {kind} data."
 
 

@@ -15,10 +15,10 @@ import numpy as np
 
 try:
     from .files import read_text, write_text
-    from .geometry import check_poses, relative_pose, wrap_angle
+    from .geometry import check_fields, check_poses, relative_pose, wrap_angle
 except ImportError:  # this file was copied on its own
     from files import read_text, write_text
-    from geometry import check_poses, relative_pose, wrap_angle
+    from geometry import check_fields, check_poses, relative_pose, wrap_angle
 
 CLASSES = ((1.0, 2.0), (2.0, 5.0), (5.0, 10.0))  # limits of Table III: position [m], heading [deg]
 KITTI_LENGTHS_M = tuple(100.0 * k for k in range(1, 9))  # stretches of the KITTI odometry benchmark [m]
@@ -122,11 +122,20 @@ class FailureRule:
         Heading error above which a scan is off [rad].
     seconds : float
         Time over which every scan must be off [s].
+
+    Raises
+    ------
+    EvaluationError
+        If a value is out of its range; the message names it.
     """
 
     max_position_m: float = 20.0
     max_yaw_rad: float = np.deg2rad(45.0)
     seconds: float = 5.0
+
+    def __post_init__(self) -> None:
+        allowed = {"(0, inf]": "max_position_m max_yaw_rad", "[0, inf]": "seconds"}
+        check_fields(self, allowed, EvaluationError)
 
 
 @dataclass

@@ -167,10 +167,11 @@ def detect_points(
     Raises
     ------
     ValueError
-        If there is no such detector.
+        If there is no such detector, or the scan is refused by `rol.radar.check_scan`.
     """
     from . import radar
 
+    codes, azimuths = radar.check_scan(codes, azimuths)
     resolution = radar.MEASURED_RANGE_RESOLUTION if range_resolution is None else range_resolution
     offset = radar.MEASURED_RANGE_OFFSET if range_offset is None else range_offset
     min_bin = max(int(np.ceil((min_range_m - offset) / resolution - 0.5)), 0)

@@ -7,7 +7,16 @@ pose of ``b`` as seen from ``a``. A 3D transform is a 4 x 4 matrix with the same
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import fields
+from typing import Any
+
 import numpy as np
+
+MAX_EXTENT_M, MAX_GRID_BYTES = (
+    1e5,
+    2**33,
+)  # a map beyond 100 km, a grid beyond 8 GiB: a stray point, most likely
 
 
 def wrap_angle(angle: np.ndarray | float) -> np.ndarray | float:
@@ -53,6 +62,96 @@ def check_poses(poses: np.ndarray, name: str = "poses") -> np.ndarray:
         first = np.argwhere(~np.isfinite(poses))[0]
         raise ValueError(f"{name}: value at index {tuple(int(i) for i in first)} is not finite")
     return poses
+
+
+def check_fields(
+    settings: Any, allowed: Mapping[str | tuple[str, ...], str], error: type[ValueError] = ValueError
+) -> None:
+    """Check that the fields of a settings class are in their ranges.
+
+    Parameters
+    ----------
+    settings : dataclass
+        Instance to check; fields declared as ``int`` must be whole numbers, tuples are checked value by value.
+    allowed : mapping
+        Range or choices -> names of the fields, separated by spaces. A range is written as an interval, such as
+        "(0, inf)", where a bracket includes the bound; choices are a tuple of words.
+    error : type
+        Exception to raise.
+
+    Raises
+    ------
+    ValueError
+        Or the given ``error``, with the field's name, its value and what is allowed; NaN is in no range.
+    """
+    kinds = {field.name: str(field.type) for field in fields(settings)}
+    for span, names in allowed.items():
+        for name in names.split():
+            value = getattr(settings, name)
+            if isinstance(span, tuple):
+                if value not in span:
+                    raise error(f"{name}: {value!r} is none of {', '.join(span)}")
+            elif not _is_in(value, span, kinds[name] == "int"):
+                kind = "a whole number in " if kinds[name] == "int" else "in "
+                raise error(f"{name}: {value} is not {kind}{span}")
+
+
+def _is_in(value: Any, span: str, is_whole: bool) -> bool:
+    """Check whether a number, or each number of nested tuples, lies in an interval such as "[0, 1)"."""
+    values = np.asarray(value)
+    if values.dtype.kind not in ("iu" if is_whole else "iuf"):
+        return False
+    low, high = (float(bound) for bound in span[1:-1].split(","))
+    above = values >= low if span[0] == "[" else values > low
+    below = values <= high if span[-1] == "]" else values < high
+    return bool((above & below).all())
+
+
+def check_grid(
+    shape: tuple[float, ...] | np.ndarray,
+    points: np.ndarray,
+    name: str,
+    *,
+    n_bytes: int = 1,
+    error: type[ValueError] = ValueError,
+) -> tuple[int, ...]:
+    """Check, before it is allocated, that a grid around points is of a size that memory holds.
+
+    Parameters
+    ----------
+    shape : sequence of float
+        Cells in each direction.
+    points : array, shape (m, 2)
+        Points that the grid is made for, at least one [m].
+    name : str
+        What the points are called in the message, such as "map".
+    n_bytes : int
+        Bytes per cell.
+    error : type
+        Exception to raise.
+
+    Returns
+    -------
+    shape : tuple of int
+        The same shape.
+
+    Raises
+    ------
+    ValueError
+        Or the given ``error``, when the grid is larger than ``MAX_GRID_BYTES`` or the points reach over more than
+        ``MAX_EXTENT_M``; it says how far the points reach and how many of them lie far from the others.
+    """
+    size = n_bytes * float(np.prod(np.asarray(shape, dtype=np.float64)))
+    low, high = points.min(axis=0), points.max(axis=0)
+    if size <= MAX_GRID_BYTES and (high - low <= MAX_EXTENT_M).all():
+        return tuple(int(n) for n in shape)
+    away = np.hypot(*(points - np.median(points, axis=0)).T)
+    n_far, farthest = int(np.sum(away > 10.0 * np.median(away))), points[away.argmax()]
+    need = f"; their grid would take {size / 2**30:,.0f} GiB" if size > MAX_GRID_BYTES else ""
+    raise error(
+        f"{name}: points from x {low[0]:.6g} to {high[0]:.6g} m and y {low[1]:.6g} to {high[1]:.6g} m; {n_far} of"
+        f" {len(points)} lie far from the others, the farthest at ({farthest[0]:.6g}, {farthest[1]:.6g}) m{need}"
+    )
 
 
 def compose(T_a_b: np.ndarray, T_b_c: np.ndarray) -> np.ndarray:

@@ -18,10 +18,10 @@ from scipy.spatial import cKDTree
 
 try:
     from .files import write_bytes
-    from .geometry import check_poses, compose, transform_points
+    from .geometry import check_grid, check_poses, compose, transform_points
 except ImportError:  # this file was copied on its own
     from files import write_bytes
-    from geometry import check_poses, compose, transform_points
+    from geometry import check_grid, check_poses, compose, transform_points
 
 
 _WAITING_POINTS = 50_000  # so many points are added to a map at once
@@ -268,7 +268,7 @@ def save_map(path: Path | str, points: np.ndarray, T_map_session: np.ndarray) ->
     Raises
     ------
     MapError
-        If there is no point or a value is not finite.
+        If there is no point, a value is not finite, or the map reaches over more than 100 km.
     """
     _check_map(path, points, T_map_session)
     content = io.BytesIO()
@@ -294,7 +294,7 @@ def load_map(path: Path | str) -> tuple[np.ndarray, np.ndarray]:
     Raises
     ------
     MapError
-        If the file is missing, truncated, or holds no map.
+        If the file is missing, truncated, or holds no map, or one that reaches over more than 100 km.
     """
     if not Path(path).is_file():
         raise MapError(f"{path}: missing; chapter 06 writes it")
@@ -316,6 +316,7 @@ def _check_map(path: Path | str, points: np.ndarray, T_map_session: np.ndarray) 
         raise MapError(f"{path}: the map is empty")
     if not (np.isfinite(points).all() and np.isfinite(T_map_session).all()):
         raise MapError(f"{path}: a value is not finite")
+    check_grid((1, 1), points, str(path), error=MapError)
 
 
 def _unique_cells(points: np.ndarray, cell: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

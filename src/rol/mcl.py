@@ -16,10 +16,10 @@ from numba import get_num_threads, prange
 
 try:
     from .compiled import compiled
-    from .geometry import check_poses, compose, wrap_angle
+    from .geometry import check_fields, check_grid, check_poses, compose, wrap_angle
 except ImportError:  # this file was copied on its own
     from compiled import compiled
-    from geometry import check_poses, compose, wrap_angle
+    from geometry import check_fields, check_grid, check_poses, compose, wrap_angle
 
 
 class MclError(ValueError):
@@ -70,6 +70,11 @@ class MclSettings:
     min_particles : int
         Below ``n_particles`` their number follows the particles' spread, see `count_needed`, but never falls under
         this; 0 keeps it as it is.
+
+    Raises
+    ------
+    MclError
+        If a value is out of its range; the message names it.
     """
 
     n_particles: int = 500
@@ -89,6 +94,18 @@ class MclSettings:
     resample_below: float = 1.0
     cell_m: float = 0.125
     min_particles: int = 0
+
+    def __post_init__(self) -> None:
+        allowed = {
+            "[1, inf)": "n_particles",
+            "(0, inf)": "exponent d_th_m sigma_m cell_m",
+            "[0, inf)": "noise_forward_m noise_side_m noise_yaw_rad noise_per_m noise_yaw_per_rad "
+            "start_spread_m start_spread_yaw_rad crowd_m min_particles",
+            "[0, 1]": "resample_below",
+            ("count", "distance"): "likelihood",
+            ("multinomial", "systematic"): "resampling",
+        }
+        check_fields(self, allowed, MclError)
 
 
 def settings_for(method: str, **changes: object) -> MclSettings:
@@ -111,7 +128,7 @@ def settings_for(method: str, **changes: object) -> MclSettings:
     Raises
     ------
     MclError
-        If the method is unknown.
+        If the method is unknown, or a value is out of its range.
     """
     methods = {
         "paper": MclSettings(),
@@ -193,14 +210,16 @@ def stamp_grid(
     Raises
     ------
     MclError
-        If the map is empty or not finite.
+        If the map is empty, not finite or too large for a grid, or a length is not above zero.
     """
     map_points = _check_points(map_points, "map")
     if len(map_points) == 0:
         raise MclError("the map holds no point")
+    if not (0.0 < cell < np.inf and 0.0 < reach < np.inf):
+        raise MclError(f"grid of the map: cell {cell} m and reach {reach} m must be above zero")
     origin = np.floor((map_points.min(axis=0) - reach) / cell) * cell
-    shape = np.ceil((map_points.max(axis=0) + reach - origin) / cell).astype(int)
-    values = np.zeros(tuple(shape), dtype=np.uint8)
+    shape = np.ceil((map_points.max(axis=0) + reach - origin) / cell)
+    values = np.zeros(check_grid(shape, map_points, "map", error=MclError), dtype=np.uint8)
     _stamp(values, (map_points - origin) / cell, reach / cell, codes)
     return values, origin
 
@@ -280,8 +299,6 @@ def build_grid(map_points: np.ndarray, settings: MclSettings) -> MapGrid:
     """
     if settings.likelihood == "count":
         return build_matched_grid(map_points, settings.d_th_m, settings.cell_m)
-    if settings.likelihood != "distance":
-        raise MclError(f"unknown likelihood {settings.likelihood!r}; there are count, distance")
     return build_distance_grid(map_points, settings.sigma_m, settings.cell_m, settings.crowd_m)
 
 

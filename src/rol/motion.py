@@ -13,9 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 
 try:
-    from .geometry import check_poses, compose, wrap_angle
+    from .geometry import check_fields, check_poses, compose, wrap_angle
 except ImportError:  # this file was copied on its own
-    from geometry import check_poses, compose, wrap_angle
+    from geometry import check_fields, check_poses, compose, wrap_angle
 
 
 LEAST_NOISE = (0.02, 0.01, np.deg2rad(0.1))  # of a car that is taken to stand: it may creep [m, m, rad]
@@ -38,6 +38,11 @@ class MotionModel:
     still_m : float
         Length below which a car counts as standing [m]. 0.08: of the real odometry's steps while the car stands, 99 %
         are shorter.
+
+    Raises
+    ------
+    ValueError
+        If a value is out of its range; the message names it.
     """
 
     matrix: tuple[tuple[float, ...], ...] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
@@ -48,6 +53,14 @@ class MotionModel:
     outlier_share: float = 0.02
     outlier_scale: float = 10.0
     still_m: float = 0.08
+
+    def __post_init__(self) -> None:
+        allowed = {
+            "(-inf, inf)": "matrix still_matrix",
+            "[0, inf)": "still driving moving outlier_scale still_m",
+            "[0, 1]": "outlier_share",
+        }
+        check_fields(self, allowed)
 
 
 def learn_motion(

@@ -17,10 +17,10 @@ import numpy as np
 
 try:
     from .compiled import compiled
-    from .geometry import check_poses, compose, relative_pose, transform_points, wrap_angle
+    from .geometry import check_fields, check_poses, compose, relative_pose, transform_points, wrap_angle
 except ImportError:  # this file was copied on its own
     from compiled import compiled
-    from geometry import check_poses, compose, relative_pose, transform_points, wrap_angle
+    from geometry import check_fields, check_poses, compose, relative_pose, transform_points, wrap_angle
 
 
 _FIRST_REACH = (6.0, 0.8, np.deg2rad(4.0))  # of a search for the first motion [m, m, rad]
@@ -667,6 +667,11 @@ class LocalMapSettings:
         Yaw rate beyond which a motion is not believed [rad/s]. 1.5: a tight turn at 15 km/h has 1.
     patience_s : float
         After so long without a motion that is believed the local map begins anew [s].
+
+    Raises
+    ------
+    ValueError
+        If a value is out of its range; the message names it.
     """
 
     map_length_m: float = 20.0
@@ -688,6 +693,17 @@ class LocalMapSettings:
     max_acceleration: float = 10.0
     max_yaw_rate: float = 1.5
     patience_s: float = 3.0
+
+    def __post_init__(self) -> None:
+        allowed = {
+            "(0, inf)": "map_length_m cell_m line_radius_m start_scale_m end_scale_m",
+            "(0, inf]": "max_acceleration max_yaw_rate",
+            "[0, inf)": "keyframe_m keyframe_rad line_ratio along_weight tolerance",
+            "[0, inf]": "patience_s",
+            "[1, inf)": "min_views max_iterations min_matched max_points rounds",
+            "[0, 1]": "min_share",
+        }
+        check_fields(self, allowed)
 
 
 @dataclass(frozen=True)

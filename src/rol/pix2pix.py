@@ -28,8 +28,10 @@ from torch.nn import functional
 
 try:
     from .files import write_bytes
+    from .geometry import check_fields
 except ImportError:  # this file was copied on its own
     from files import write_bytes
+    from geometry import check_fields
 
 if TYPE_CHECKING:
     from .unet import UnetGenerator
@@ -79,6 +81,17 @@ class TrainConfig:
     )
     report_every: int = 50  # steps per row of the history, each with a look at the held-out pairs
     checkpoint_every: int = 500  # steps between checkpoints, a multiple of the above: minutes lost at most
+
+    def __post_init__(self) -> None:
+        allowed = {
+            tuple(ARCHITECTURES): "network",
+            ("l1", "entropy"): "pixel_loss",
+            "[1, inf)": "filters discriminator_filters epochs batch report_every checkpoint_every",
+            "[0, inf)": "blocks steps lambda_l1 gan_weight gain_spread_db streaks ghosts",
+            "(0, inf)": "occupied_weight learning_rate",
+            "[0, 1)": "beta1 beta2",
+        }
+        check_fields(self, allowed, Pix2PixError)
 
     def n_steps(self, n_pairs: int) -> int:
         """Give the number of optimiser steps for a data set of `n_pairs` pairs."""

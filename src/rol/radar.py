@@ -18,6 +18,8 @@ KIT_RANGE_RESOLUTION, KIT_RANGE_OFFSET = 0.0432, 0.0
 MEASURED_RANGE_RESOLUTION, MEASURED_RANGE_OFFSET = 0.0438, -0.31
 DOPPLER_SECONDS = 0.049  # a target ahead reads nearer by this time multiplied by the closing speed
 SCAN_SECONDS = 0.25  # one turn
+MAX_GAP = 2.5  # rows farther apart than this many mean steps: nothing was measured between them
+TABLE_STEPS = 64  # entries per row of the table for unevenly spaced azimuths
 _CODE_POWER = 10.0 ** (np.arange(256) / 20.0)  # a code is half a decibel
 
 
@@ -45,7 +47,8 @@ def polar_to_cartesian(
     codes : array, shape (a, b)
         Power codes 0..255, one row per azimuth.
     azimuths : array, shape (a,)
-        Counter-clockwise bearings of the rows, decreasing in even steps [rad].
+        Counter-clockwise bearings of the rows, decreasing, not wrapped [rad]. A pixel is interpolated between
+        the two rows next to its bearing; in gaps wider than ``MAX_GAP`` mean steps the image is 0.
     range_resolution, range_offset : float
         Length of a bin and shift of all ranges [m].
     pixel_size : float
@@ -69,25 +72,29 @@ def polar_to_cartesian(
     Raises
     ------
     ValueError
-        If shapes disagree or the azimuths do not decrease.
+        If shapes disagree, the codes are no power codes, or the azimuths do not decrease within one turn.
 
     Notes
     -----
     Input of the generator in Yin et al. 2020, Sec. III-A; 512 pixels of 0.25 m: Sec. IV-A.
     """
-    codes, azimuths = _check_scan(codes, azimuths)
+    codes, azimuths = check_scan(codes, azimuths)
     half = (width - 1) / 2.0 * pixel_size
     axis = np.linspace(half, -half, width, dtype=np.float32)
     x, y = np.repeat(axis[:, None], width, axis=1), np.repeat(axis[None, :], width, axis=0)
-    first, step = np.mod(-azimuths[0], 2.0 * np.pi), azimuths[0] - azimuths[1]
+    first, step = np.mod(-azimuths[0], 2.0 * np.pi), (azimuths[0] - azimuths[-1]) / (len(azimuths) - 1)
+    n_turn = 2.0 * np.pi / step  # rows of an evenly spaced scan; `rows` counts those up to the last lines
     clockwise = np.arctan2(-y, x)
     np.add(clockwise, np.float32(2.0 * np.pi), out=clockwise, where=clockwise < 0.0)
     rows = (clockwise - np.float32(first)) / np.float32(step)
-    np.add(rows, np.float32(len(codes)), out=rows, where=rows < -1.0)  # scans that do not begin ahead
+    np.add(rows, np.float32(n_turn), out=rows, where=rows < -1.0)  # scans that do not begin ahead
     if twist is None:
         ranges = np.sqrt(x * x + y * y)
     else:
         ranges, rows = _beam_at_places(x, y, rows, len(codes), step, twist, scan_seconds, doppler_seconds)
+    table = _row_table(azimuths, step)
+    if table is not None:
+        rows = table.take(((rows + np.float32(1.0)) * np.float32(TABLE_STEPS)).astype(np.intp), mode="clip")
     bins = np.maximum((ranges - range_offset - range_resolution / 2.0) / range_resolution, 0.0).astype(
         np.float32
     )
@@ -211,8 +218,13 @@ def find_peaks(
     -------
     rows, bins : array, shape (n,)
         Indices of the peaks, by row, the strongest of a row first; equal codes nearest first.
+
+    Raises
+    ------
+    ValueError
+        If the codes are not uint8.
     """
-    codes = np.asarray(codes)
+    codes = _check_codes(codes)
     is_peak = codes >= max(min_code, 1)
     is_peak[:, 1:] &= codes[:, 1:] > codes[:, :-1]  # of a plateau the first bin counts
     is_peak[:, :-1] &= codes[:, :-1] >= codes[:, 1:]
@@ -253,15 +265,15 @@ def cfar_peaks(
     Raises
     ------
     ValueError
-        If a width is not positive or a row is too short for the window.
+        If the codes are not uint8, a width is not positive or a row is too short for the window.
 
     Notes
     -----
     Cells at the ends of a row take the floor from the side they have. The floor is a mean of powers, not of
     decibels, as in the classical detector.
     """
-    codes, reach = np.asarray(codes), guard_bins + train_bins
-    if guard_bins < 0 or train_bins < 1 or codes.ndim != 2 or codes.shape[1] <= 2 * reach:
+    codes, reach = _check_codes(codes), guard_bins + train_bins
+    if guard_bins < 0 or train_bins < 1 or codes.shape[1] <= 2 * reach:
         raise ValueError(
             f"CFAR: guard {guard_bins} and train {train_bins} bins do not fit codes {codes.shape}"
         )
@@ -317,7 +329,13 @@ def peaks_to_points(
     -------
     points : array, shape (n, 2)
         Points in the radar frame [m].
+
+    Raises
+    ------
+    ValueError
+        If the azimuths do not decrease within one turn.
     """
+    azimuths = _check_azimuths(azimuths)
     ranges, bearings = (bins + 0.5) * range_resolution + range_offset, azimuths[rows]
     if twist is not None:
         ranges = ranges - doppler_shift(bearings, twist, doppler_seconds)
@@ -366,8 +384,13 @@ def k_strongest_peaks(
     -------
     points : array, shape (n, 2)
         Points in the radar frame [m].
+
+    Raises
+    ------
+    ValueError
+        If `check_scan` refuses the scan.
     """
-    codes, azimuths = _check_scan(codes, azimuths)
+    codes, azimuths = check_scan(codes, azimuths)
     min_bin = int(np.ceil((min_range_m - range_offset) / range_resolution - 0.5))
     rows, bins = find_peaks(codes, k, min_code, max(min_bin, 0))
     return peaks_to_points(
@@ -376,17 +399,76 @@ def k_strongest_peaks(
     )  # fmt: skip
 
 
-def _check_scan(codes: np.ndarray, azimuths: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Refuse scans whose shapes disagree or whose azimuths do not decrease."""
+def check_scan(codes: np.ndarray, azimuths: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Refuse a scan that is transposed, turns the wrong way round, or does not hold power codes.
+
+    Parameters
+    ----------
+    codes : array, shape (a, b), uint8
+        Power codes, one row per azimuth.
+    azimuths : array, shape (a,)
+        Counter-clockwise bearings of the rows, decreasing by less than one turn in all [rad].
+
+    Returns
+    -------
+    codes, azimuths : array
+        The same as arrays, azimuths as float64.
+
+    Raises
+    ------
+    ValueError
+        If shapes disagree, the codes are not uint8, or the azimuths do not decrease within one turn.
+    """
     codes, azimuths = np.asarray(codes), np.asarray(azimuths, dtype=np.float64)
     if codes.ndim != 2 or azimuths.shape != codes.shape[:1] or len(codes) < 2:
+        is_turned = codes.ndim == 2 and azimuths.shape == codes.shape[1:]
+        hint = "; the codes are transposed" if is_turned else ""
         raise ValueError(
-            f"scan: expected codes (a, b) and azimuths (a,), got {codes.shape} and {azimuths.shape}"
+            f"scan: expected codes (a, b) and azimuths (a,), got {codes.shape} and {azimuths.shape}{hint}"
         )
-    if not (np.diff(azimuths) < 0.0).all():
-        row = int(np.argmin(np.diff(azimuths) < 0.0)) + 1
+    return _check_codes(codes), _check_azimuths(azimuths)
+
+
+def _check_codes(codes: np.ndarray) -> np.ndarray:
+    """Refuse arrays that hold no power codes, such as power in 0..1."""
+    codes = np.asarray(codes)
+    if codes.ndim != 2 or codes.dtype != np.uint8:
+        raise ValueError(
+            f"scan: expected power codes 0..255 of shape (a, b) as uint8, got {codes.dtype} {codes.shape}"
+        )
+    return codes
+
+
+def _check_azimuths(azimuths: np.ndarray) -> np.ndarray:
+    """Refuse azimuths that rise, such as clockwise ones, or go on beyond one turn."""
+    azimuths = np.asarray(azimuths, dtype=np.float64)
+    steps = np.diff(azimuths)
+    if not (steps < 0.0).all():
+        row = int(np.argmin(steps < 0.0)) + 1
         raise ValueError(f"scan: azimuths must decrease (counter-clockwise positive), row {row} does not")
-    return codes, azimuths
+    if not azimuths[0] - azimuths[-1] < 2.0 * np.pi:
+        turned = np.rad2deg(azimuths[0] - azimuths[-1])
+        raise ValueError(f"scan: azimuths must lie within one turn, they decrease by {turned:.1f} deg")
+    return azimuths
+
+
+def _row_table(azimuths: np.ndarray, step: float) -> np.ndarray | None:
+    """Tabulate the row of unevenly spaced azimuths at the rows of evenly spaced ones; None if all are even.
+
+    Entry i belongs to row ``(i + 0.5) / TABLE_STEPS - 1`` of a scan with the same first azimuth and the mean step.
+    OpenCV rounds rows to 1/32, so the nearest entry suffices.
+    """
+    n, n_turn = len(azimuths), 2.0 * np.pi / step
+    own = np.concatenate([azimuths[-1:] + 2.0 * np.pi, azimuths, azimuths[:1] - 2.0 * np.pi])
+    own = (azimuths[0] - own) / step
+    gaps, numbers = np.diff(own), np.arange(-1.0, n + 1.0)
+    if np.abs(own - numbers).max() < 1e-3:
+        return None
+    even = (np.arange(int((n_turn + 1.0) * TABLE_STEPS) + 1) + 0.5) / TABLE_STEPS - 1.0
+    even = np.where(even < own[0], even + n_turn, even)
+    gap = np.clip(np.searchsorted(own, even, side="right") - 1, 0, n)
+    rows = np.interp(even, own, numbers)
+    return np.where(gaps[gap] > MAX_GAP, -2.0, rows).astype(np.float32)  # -2: no row, so no power
 
 
 def _beam_at_places(
@@ -419,4 +501,4 @@ def _beam_at_places(
         rows = first_rows - turned / np.float32(step)
     ranges = np.sqrt(seen_x * seen_x + seen_y * seen_y)
     closing = (vx * seen_x + vy * seen_y) / np.maximum(ranges, np.float32(1e-6))
-    return ranges - np.float32(doppler_seconds) * closing, np.mod(rows, np.float32(n_rows))
+    return ranges - np.float32(doppler_seconds) * closing, np.mod(rows, np.float32(2.0 * np.pi / step))

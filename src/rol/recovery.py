@@ -21,9 +21,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 try:
-    from .geometry import check_poses, first_of_cells, wrap_angle
+    from .geometry import check_fields, check_poses, first_of_cells, wrap_angle
 except ImportError:  # this file was copied on its own
-    from geometry import check_poses, first_of_cells, wrap_angle
+    from geometry import check_fields, check_poses, first_of_cells, wrap_angle
 
 if TYPE_CHECKING:
     from .mcl import MapGrid, MclSettings, MclUpdate
@@ -80,6 +80,11 @@ class RecoverySettings:
     still_m, still_share : float
         While a step is shorter than this [m], a scan weighs with this share of the exponent: a car that stands sees the
         same false points again and again, and its scans are one witness rather than many.
+
+    Raises
+    ------
+    ValueError
+        If a value is out of its range; the message names it.
     """
 
     level: float
@@ -109,6 +114,20 @@ class RecoverySettings:
     workers: int = 1
     still_m: float = 0.05
     still_share: float = 0.25
+
+    def __post_init__(self) -> None:
+        allowed = {
+            "(0, inf)": "level window_m reach_m far_m",
+            "(0, inf]": "max_range_m",
+            "[-inf, 1]": "doubt lost",  # minus infinity: never
+            "[0, inf]": "margin trusted_margin unique far_unique trust_m moved_m still_m",
+            "[1, inf)": "scans trial n_rivals n_far_rivals rival_particles workers",
+            "[2, inf)": "window",
+            "[0, inf)": "pause trusted_pause far_pause far_after",
+            "(0, 3.15]": "reach_yaw",  # all headings are pi
+            "(0, 1]": "still_share",
+        }
+        check_fields(self, allowed)
 
 
 @dataclass(frozen=True)

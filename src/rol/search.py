@@ -18,9 +18,9 @@ from scipy import fft
 from scipy.spatial import cKDTree
 
 try:
-    from .geometry import check_poses, compose, invert, transform_points, wrap_angle
+    from .geometry import check_grid, check_poses, compose, invert, transform_points, wrap_angle
 except ImportError:  # this file was copied on its own
-    from geometry import check_poses, compose, invert, transform_points, wrap_angle
+    from geometry import check_grid, check_poses, compose, invert, transform_points, wrap_angle
 
 if TYPE_CHECKING:
     from .mcl import MapGrid
@@ -133,6 +133,11 @@ class Lattice:
         How far it reaches to each side [m].
     workers : int
         Threads.
+
+    Raises
+    ------
+    ValueError
+        If the cloud reaches so far that no memory holds the lattice.
     """
 
     def __init__(
@@ -145,7 +150,7 @@ class Lattice:
             self.n_reach + self.n_range,
             np.floor((centre - grid.origin) / grid.cell).astype(int),
         )
-        crop = np.zeros((2 * half + 1,) * 2, dtype=np.float32)
+        crop = np.zeros(check_grid((2 * half + 1,) * 2, points, "cloud", n_bytes=4), dtype=np.float32)
         low, high = np.maximum(middle - half, 0), np.minimum(middle + half + 1, grid.values.shape)
         if (high > low).all():
             part = grid.values[low[0] : high[0], low[1] : high[1]]

@@ -382,10 +382,6 @@ def _check_run(dataset: Any, config: TrainConfig) -> None:
     """Refuse what cannot be trained on."""
     if len(dataset) == 0:
         raise TrainingError("no pairs to train on")
-    if min(config.batch, config.report_every, config.n_steps(len(dataset))) < 1:
-        raise TrainingError("batch, report_every and the number of steps must be at least 1")
-    if config.pixel_loss not in ("l1", "entropy"):
-        raise TrainingError(f"pixel_loss must be 'l1' or 'entropy', not {config.pixel_loss!r}")
     if _is_drawn(config) and not hasattr(dataset, "draw"):
         raise TrainingError(
             "rotate, gain_spread_db, streaks and ghosts need pairs that are drawn, see rol.scan_pairs"

@@ -13,6 +13,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+try:
+    from ..geometry import check_fields
+except ImportError:  # this file was copied on its own
+    from geometry import check_fields
+
 if TYPE_CHECKING:
     from .scene import Scene
 
@@ -60,12 +65,21 @@ class LidarSettings:
         Farthest range [m].
     reach_m : float
         Range at which a head-on surface that sends back a tenth of the light is seen half of the time [m].
+
+    Raises
+    ------
+    ValueError
+        If a value is out of its range; the message names it.
     """
 
     range_noise_m: float = 0.02
     lost_share: float = 0.01
     max_range_m: float = 100.0
     reach_m: float = 75.0
+
+    def __post_init__(self) -> None:
+        allowed = {"[0, inf)": "range_noise_m", "[0, 1]": "lost_share", "(0, inf)": "max_range_m reach_m"}
+        check_fields(self, allowed)
 
 
 @dataclass(frozen=True)

@@ -24,10 +24,10 @@ from scipy.spatial import cKDTree
 
 try:
     from ..compiled import compiled
-    from ..geometry import check_poses, invert, transform_points
+    from ..geometry import check_fields, check_grid, check_poses, invert, transform_points
 except ImportError:  # this file was copied on its own
     from compiled import compiled
-    from geometry import check_poses, invert, transform_points
+    from geometry import check_fields, check_grid, check_poses, invert, transform_points
 
 KINDS = ("near", "beside", "false")
 
@@ -54,6 +54,11 @@ class FrontEnd:
         How many scans such a point is seen on average.
     min_range_m, max_range_m : float
         Reach of the front end [m]; 64 m is the paper's.
+
+    Raises
+    ------
+    MapPointsError
+        If a value is out of its range; the message names it.
     """
 
     share_1m: float = 0.40
@@ -64,6 +69,15 @@ class FrontEnd:
     life_scans: float = 8.0
     min_range_m: float = 2.5
     max_range_m: float = 64.0
+
+    def __post_init__(self) -> None:
+        allowed = {
+            "[0, 1]": "share_1m share_2m persistent_share",
+            "[0, inf)": "n_points near_m min_range_m",
+            "[1, inf)": "life_scans",
+            "(0, inf)": "max_range_m",
+        }
+        check_fields(self, allowed, MapPointsError)
 
 
 @dataclass(frozen=True)
@@ -126,14 +140,18 @@ def look_around(
     Raises
     ------
     MapPointsError
-        If the map is empty.
+        If the map is empty, not finite or too large for a grid.
     """
     map_points, poses = np.asarray(map_points, dtype=np.float64), check_poses(poses)
     if len(map_points) == 0:
         raise MapPointsError("the map holds no point")
+    if not np.isfinite(map_points).all():
+        raise MapPointsError("the map holds a point that is not finite")
     corner = map_points.min(axis=0) - 0.5 * cell
+    shape = np.floor((map_points.max(axis=0) - corner) / cell) + 1
+    shape = check_grid(shape, map_points, "map", error=MapPointsError)
     cells = np.floor((map_points - corner) / cell).astype(np.int64)
-    occupied = np.zeros(cells.max(axis=0) + 1, dtype=np.uint8)
+    occupied = np.zeros(shape, dtype=np.uint8)
     occupied[cells[:, 0], cells[:, 1]] = 1
     places = np.column_stack([(poses[:, :2] - corner) / cell, poses[:, 2]])
     reach, depth = max_range_m / cell, depth_m / cell

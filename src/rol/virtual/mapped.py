@@ -17,8 +17,10 @@ from scipy.spatial import cKDTree
 
 try:
     from ..compiled import compiled
+    from ..geometry import check_grid
 except ImportError:  # this file was copied on its own
     from compiled import compiled
+    from geometry import check_grid
 
 if TYPE_CHECKING:
     from .mesh import Mesh
@@ -93,7 +95,7 @@ def classify_cells(points: np.ndarray) -> Cells:
     Raises
     ------
     ValueError
-        If the map is empty or not finite.
+        If the map is empty, not finite or too large for a grid.
     """
     points = np.asarray(points, dtype=np.float64)
     if points.ndim != 2 or points.shape[1] != 2 or len(points) == 0 or not np.isfinite(points).all():
@@ -126,8 +128,8 @@ def crop_cells(cells: Cells, places: np.ndarray, radius: float, *, clear_m: floa
 
 def _sort_into_cells(points: np.ndarray, side: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Sort points into square cells: their order, each one's cell, and where each cell begins, by row and column."""
+    shape = check_grid(np.floor(np.ptp(points, axis=0) / side) + 1, points, "map", n_bytes=32)
     cell_of = np.floor((points - points.min(axis=0)) / side).astype(np.int64)
-    shape = cell_of.max(axis=0) + 1
     flat = cell_of[:, 0] * shape[1] + cell_of[:, 1]
     order = np.argsort(flat, kind="stable")
     starts = np.searchsorted(flat[order], np.arange(shape[0] * shape[1] + 1))

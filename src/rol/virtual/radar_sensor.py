@@ -17,9 +17,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 try:
-    from ..geometry import check_poses
+    from ..geometry import check_fields, check_poses
 except ImportError:  # this file was copied on its own
-    from geometry import check_poses
+    from geometry import check_fields, check_poses
 
 if TYPE_CHECKING:
     from .radar_surfaces import Surface
@@ -63,6 +63,11 @@ class RadarSettings:
         See `radar_signal.echoes_to_codes`.
     surfaces : dict
         Name of a material -> `Surface`, in place of the usual ones.
+
+    Raises
+    ------
+    ValueError
+        If a value is out of its range; the message names it.
     """
 
     height: float = 2.0
@@ -82,6 +87,17 @@ class RadarSettings:
     streak_scale: float = 1.0
     interference_rate: float = 0.3
     surfaces: dict[str, Surface] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        allowed = {
+            "(0, inf)": "height layer_widths_deg haze_length max_range",
+            "[1, inf)": "rays_per_row",
+            "[-90, 90]": "layers_deg",
+            "(-inf, inf)": "layer_gains_db range_exponent haze_db doppler_seconds",
+            "[0, 255]": "gain_code",
+            "[0, inf)": "bounces veil_layers noise_scale streak_scale interference_rate",
+        }
+        check_fields(self, allowed)
 
 
 @dataclass

@@ -15,6 +15,11 @@ try:
 except ImportError:  # this file was copied on its own
     from compiled import compiled
 
+try:
+    from ..geometry import check_fields
+except ImportError:  # this file was copied on its own
+    from geometry import check_fields
+
 CELL = 0.5  # grain of the world along a surface [m]: what a brick pier, a drain pipe, a window frame take up
 MOST_CELLS = 12  # cells that may answer between two neighbouring rays
 ASPECT = np.deg2rad(4.0)  # incidence over which a cell answers alike
@@ -41,6 +46,11 @@ class Surface:
         Share of power mirrored onwards.
     passes : float
         Share of power that goes straight through.
+
+    Raises
+    ------
+    ValueError
+        If a value is out of its range; the message names it.
     """
 
     diffuse: float
@@ -51,6 +61,14 @@ class Surface:
     corner_share: float = 0.0
     mirror: float = 0.0
     passes: float = 0.0
+
+    def __post_init__(self) -> None:
+        allowed = {
+            "[0, inf)": "diffuse slope specular corner",
+            "(0, 90]": "lobe_deg",
+            "[0, 1]": "corner_share mirror passes",
+        }
+        check_fields(self, allowed)
 
 
 # By the names of `mesh.Material`. Set so that brightness shares, ring by ring, come near those of real scans.

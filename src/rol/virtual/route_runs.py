@@ -234,12 +234,18 @@ def run_from(
         One per scan.
     clouds : list of array, shape (m, 2)
         Their points [m].
+
+    Raises
+    ------
+    ValueError
+        If the session has no such first scan.
     """
     from ..mcl import settings_for
     from ..motion import mover, screen_steps
     from ..recovery import RecoverySettings, localize_with_recovery
     from .map_points import Sight, draw_clouds
 
+    _check_first(stage, first)
     poses, rng = stage.route.truth[first : first + n_scans], np.random.default_rng([seed, first])
     starts = stage.sight.starts[first : first + len(poses) + 1]
     sight = Sight(stage.sight.points[starts[0] : starts[-1]], starts - starts[0])
@@ -263,6 +269,13 @@ def run_from(
     return updates, clouds
 
 
+def _check_first(stage: Stage, first: int) -> None:
+    """Refuse a first scan that the session does not have; a negative one would count from its end."""
+    if not 0 <= first < len(stage.route.truth):
+        n_scans = len(stage.route.truth)
+        raise ValueError(f"first: {first} is no scan of session {stage.route.number}, which has {n_scans}")
+
+
 def kidnap(stage: Stage, first: int, seed: int, *, n_scans: int = 60) -> tuple[RecoveryTrial, list, list]:
     """Begin at a pose that is 20 m and 20 deg off, in the firm belief that it is right.
 
@@ -283,9 +296,15 @@ def kidnap(stage: Stage, first: int, seed: int, *, n_scans: int = 60) -> tuple[R
         How it went.
     updates, clouds : list
         See `run_from`.
+
+    Raises
+    ------
+    ValueError
+        If the session has no such first scan.
     """
     from ..route import displace, judge_recovery
 
+    _check_first(stage, first)
     start = displace(
         stage.route.truth[first], 20.0, np.deg2rad(20.0), np.random.default_rng([seed, first, 2])
     )
@@ -319,9 +338,15 @@ def start_anywhere(
         How it went.
     updates, clouds : list
         See `run_from`.
+
+    Raises
+    ------
+    ValueError
+        If the session has no such first scan.
     """
     from ..route import displace, judge_recovery
 
+    _check_first(stage, first)
     rng = np.random.default_rng([seed, first, 3])
     start = displace(stage.route.truth[first], within_m * np.sqrt(rng.random()), 0.0, rng)
     start[2] = rng.uniform(-np.pi, np.pi)

@@ -460,7 +460,7 @@ def sensor_settings(settings: VirtualSettings) -> tuple[LidarSettings, RadarSett
     Raises
     ------
     SettingsError
-        If a sensor has no such setting.
+        If a sensor has no such setting, or its value is out of its range.
     """
     from .lidar_sensor import LidarSettings
     from .radar_sensor import RadarSettings
@@ -476,4 +476,9 @@ def _fill(kind: type, values: dict[str, Any], name: str) -> Any:
     unknown = sorted(set(values) - set(known))
     if unknown:
         raise SettingsError(f"virtual: {name}: unknown key {unknown[0]!r}; known are: {', '.join(known)}")
-    return kind(**{key: tuple(value) if isinstance(value, list) else value for key, value in values.items()})
+    try:
+        return kind(
+            **{key: tuple(value) if isinstance(value, list) else value for key, value in values.items()}
+        )
+    except ValueError as error:
+        raise SettingsError(f"virtual: {name}: {error}") from error

@@ -9,6 +9,11 @@ from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
+try:
+    from ..geometry import check_fields
+except ImportError:  # this file was copied on its own
+    from geometry import check_fields
+
 SWEEPS = ("nearest", "all", "none")
 
 
@@ -49,6 +54,11 @@ class SessionSettings:
         standing are then the true ones.
     first_scan : int
         World "route" only: where in the pose file the session begins. With `scans` 0 it goes on to the end.
+
+    Raises
+    ------
+    SettingsError
+        If a value is out of its range or `start` is no date and time; the message names it.
     """
 
     start: str
@@ -65,6 +75,20 @@ class SessionSettings:
     sweeps: str = ""
     poses: str = ""
     first_scan: int = 0
+
+    def __post_init__(self) -> None:
+        allowed = {
+            "(0, inf)": "cruise_mps",
+            "[0, inf)": "scans seed stops stand_s leaf_density vehicles people first_scan",
+            "[0, 1]": "parked_share",
+            "[0, 0.3]": "changed_share",
+            ("", *SWEEPS): "sweeps",
+        }
+        check_fields(self, allowed, SettingsError)
+        try:
+            self.first_stamp_us  # noqa: B018 (only to see whether it can be read)
+        except ValueError as error:
+            raise SettingsError(f"start: {self.start!r} is not a date and time: {error}") from error
 
     @property
     def first_stamp_us(self) -> int:
@@ -108,6 +132,11 @@ class VirtualSettings:
         World "route" only: things that the map does not show, as a share of the groups of cells that it shows.
     lidar, radar : dict
         Settings of `LidarSettings` and `RadarSettings` other than the usual ones.
+
+    Raises
+    ------
+    SettingsError
+        If a value is out of its range; the message names it.
     """
 
     sessions: dict[str, SessionSettings] = field(default_factory=dict)
@@ -125,6 +154,17 @@ class VirtualSettings:
     unmapped_share: float = 1.8
     lidar: dict[str, Any] = field(default_factory=dict)
     radar: dict[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        allowed = {
+            "[450, inf)": "loop_m",  # shorter ones leave no room for streets with houses
+            "(0, inf)": "radar_height_m",
+            "[0, inf)": "seed relief_m labels_every odometry_scale odometry_yaw_rad unmapped_share",
+            "(-inf, inf)": "start_m",
+            SWEEPS: "sweeps",
+            ("town", "route"): "world",
+        }
+        check_fields(self, allowed, SettingsError)
 
 
 def parse_settings(section: Mapping[str, Any], where: str = "virtual") -> VirtualSettings:
@@ -156,25 +196,17 @@ def parse_settings(section: Mapping[str, Any], where: str = "virtual") -> Virtua
         values = _as_mapping(values, place)
         if "start" not in values:
             raise SettingsError(f"{place}: the key 'start' is missing")
-        sessions[str(name)] = _check_session(
-            SessionSettings(**_check_types(SessionSettings, values, place)), place, str(section.get("world"))
-        )
-    settings = VirtualSettings(sessions, **_check_types(VirtualSettings, section, where))
-    _check_ranges(
-        settings,
-        where,
-        positive=("loop_m", "radar_height_m"),
-        not_negative=("seed", "relief_m", "labels_every", "unmapped_share"),
-    )
-    if settings.loop_m < 450.0:
-        raise SettingsError(
-            f"{where}: loop_m: {settings.loop_m} is too short for streets with houses, 450 at least"
-        )
-    if settings.sweeps not in SWEEPS:
-        raise SettingsError(f"{where}: sweeps: {settings.sweeps!r} is none of {', '.join(SWEEPS)}")
-    if settings.world not in ("town", "route"):
-        raise SettingsError(f"{where}: world: {settings.world!r} is neither 'town' nor 'route'")
-    return settings
+        session = _fill(SessionSettings, values, place)
+        if section.get("world") == "route" and not session.poses:
+            raise SettingsError(
+                f"{place}: the key 'poses' is missing, the number of a pose file of the real route"
+            )
+        if session.scans < 3 and not (section.get("world") == "route" and session.scans == 0):
+            raise SettingsError(
+                f"{place}: scans: {session.scans} is too few, 3 are needed for one step of odometry"
+            )
+        sessions[str(name)] = session
+    return _fill(VirtualSettings, section, where, sessions=sessions)
 
 
 def load_settings(path: Path | str) -> VirtualSettings:
@@ -275,6 +307,15 @@ def _as_mapping(value: Any, where: str) -> Mapping[str, Any]:
     return value
 
 
+def _fill(kind: type, values: Mapping[str, Any], where: str, **others: Any) -> Any:
+    """Make settings of values; refuse unknown keys, other types and values out of range."""
+    values = _check_types(kind, values, where)
+    try:
+        return kind(**others, **values)
+    except SettingsError as error:
+        raise SettingsError(f"{where}: {error}") from error
+
+
 def _check_types(kind: type, values: Mapping[str, Any], where: str) -> dict[str, Any]:
     """Refuse keys that the dataclass lacks and values of another type; whole numbers pass as floats."""
     known = {f.name: str(f.type) for f in fields(kind) if f.name != "sessions"}
@@ -289,46 +330,5 @@ def _check_types(kind: type, values: Mapping[str, Any], where: str) -> dict[str,
         wanted = {"float": float, "int": int, "str": str}.get(known[key], dict)
         if not isinstance(value, wanted) or isinstance(value, bool):
             raise SettingsError(f"{where}: {key}: expected {wanted.__name__}, got {value!r}")
-        if wanted is float and not abs(value) < float("inf"):
-            raise SettingsError(f"{where}: {key}: {value} is not a finite number")
         checked[key] = value
     return checked
-
-
-def _check_session(session: SessionSettings, where: str, world: str) -> SessionSettings:
-    try:
-        session.first_stamp_us  # noqa: B018 (only to see whether it can be read)
-    except ValueError as error:
-        raise SettingsError(f"{where}: start: {session.start!r} is not a date and time: {error}") from error
-    _check_ranges(
-        session, where, positive=("cruise_mps",),
-        not_negative=(
-            "seed", "stops", "stand_s", "parked_share", "leaf_density", "changed_share", "vehicles", "people",
-            "scans", "first_scan",
-        ),
-    )  # fmt: skip
-    if session.sweeps and session.sweeps not in SWEEPS:
-        raise SettingsError(f"{where}: sweeps: {session.sweeps!r} is none of {', '.join(SWEEPS)}")
-    if world == "route" and not session.poses:
-        raise SettingsError(
-            f"{where}: the key 'poses' is missing, the number of a pose file of the real route"
-        )
-    if session.scans < 3 and not (world == "route" and session.scans == 0):
-        raise SettingsError(
-            f"{where}: scans: {session.scans} is too few, 3 are needed for one step of odometry"
-        )
-    for key, most in (("parked_share", 1.0), ("changed_share", 0.3)):
-        if getattr(session, key) > most:
-            raise SettingsError(f"{where}: {key}: {getattr(session, key)} is more than {most}")
-    return session
-
-
-def _check_ranges(
-    settings: Any, where: str, positive: tuple[str, ...], not_negative: tuple[str, ...]
-) -> None:
-    for key in (*positive, *not_negative):
-        value = getattr(settings, key)
-        if value < 0 or (value == 0 and key in positive):
-            raise SettingsError(
-                f"{where}: {key}: {value} must {'be positive' if key in positive else 'not be negative'}"
-            )
