@@ -131,7 +131,7 @@ def paper(clouds: Clouds, stamps_us: np.ndarray, search: bool = False) -> Steps:
 
 
 def paper_by_tree(clouds: Clouds, stamps_us: np.ndarray) -> Steps:
-    """Steps of the paper's ICP as NumPy and SciPy's k-d tree find them."""
+    """Compute the steps of the paper's ICP with NumPy and SciPy's k-d tree."""
     step = np.zeros(3)
     for target, source in pairwise(clouds):
         step = align_by_tree(source, target, step)
@@ -139,7 +139,7 @@ def paper_by_tree(clouds: Clouds, stamps_us: np.ndarray) -> Steps:
 
 
 def align_by_tree(source: np.ndarray, target: np.ndarray, step: np.ndarray) -> np.ndarray:
-    """Do what `rol.odometry.icp_2d` does with its defaults, with a k-d tree."""
+    """Register two clouds as `rol.odometry.icp_2d` does by default, with a k-d tree."""
     limit, tree = 3.0, cKDTree(target)
     source = source[np.linspace(0, len(source) - 1, min(len(source), 1000)).astype(int)]
     for _ in range(ITERATIONS):

@@ -103,7 +103,7 @@ def wall(length_m: float = 60.0, noise_m: float = 0.1, seed: int = 0) -> np.ndar
     return transform_points((3.0, 5.0, 0.6), np.column_stack([along, noise]))
 
 
-def test_icp_tells_that_a_wall_leaves_one_direction_open():
+def test_icp_reports_that_a_wall_leaves_one_direction_unconstrained():
     along = transform_points((0.0, 0.0, 0.6), np.array([[2.0, 0.0]]))[0]  # 2 m along the wall
     one = icp_2d(wall()[40:-40] + along, wall(seed=1))
     assert one.converged and one.weakest_direction < 0.05
@@ -322,7 +322,7 @@ def test_lines_are_fitted_to_the_twelve_nearest_points():
     assert 20 < n_lines < 180
 
 
-def test_robust_registration_tells_that_a_wall_leaves_one_direction_open():
+def test_robust_registration_reports_that_a_wall_leaves_one_direction_unconstrained():
     settings = LocalMapSettings()
     found = register_robust(wall()[20:-20], build_local_map([wall(seed=1)], settings), np.zeros(3), settings)
     assert found.converged and found.weakest_direction < 0.1

@@ -49,10 +49,10 @@ class IcpResult:
     converged : bool
         True when the last fits moved less than the tolerance; False also for clouds too small to be matched.
     weakest_direction : float
-        How well the last pairs constrain the translation in its worst direction, relative to its best one: near 0
-        along one straight wall, where the pose may slide although it converged, 1 where all directions are equal.
-        A pair on a line counts across the line only; the line is fitted to the target points within 2 m. NaN
-        without a fit.
+        How well the last pairs constrain the translation in its weakest direction, as a fraction of the strongest:
+        near 0 along one straight wall, where the pose can slide although ICP converged; 1 where all directions are
+        equal. A pair on a line counts only across it; the line is fitted to the target points within 2 m. NaN
+        without pairs.
     """
 
     T_target_source: np.ndarray
@@ -69,7 +69,7 @@ class SortedCloud(NamedTuple):
     Attributes
     ----------
     points : array, shape (n, 2)
-        The points, those of a cell one after the other [m].
+        The points in the order of their cells [m].
     starts : array of int, shape (k,)
         Where the points of each cell start, and their number at the end.
     around : tuple of float
@@ -175,7 +175,7 @@ def icp_2d(
     Parameters
     ----------
     source, target : array, shape (n, 2) and (m, 2)
-        Clouds in their own frames [m]; a target that is used again and again may be a `SortedCloud`.
+        Clouds in their own frames [m]; a target of several registrations may be a `SortedCloud`.
     init : array-like, shape (3,)
         First guess of T_target_source [m, m, rad].
     max_distance, min_distance : float
@@ -250,8 +250,8 @@ def search_motion(
     Raises
     ------
     OdometryError
-        If a cloud has another shape or a value that is not finite, or if both reach so far that the cells would fill
-        the memory.
+        If a cloud has another shape or a value that is not finite, or if both extend so far that the grid would need
+        more than 400 MB.
     """
     source, target = check_cloud(source, "source cloud"), check_cloud(target, "target cloud")
     best = check_poses(guess, "initial guess").copy()
@@ -395,13 +395,13 @@ def _within_reach(
     reach: tuple[float, float, float],
     cell: float,
 ) -> np.ndarray:
-    """Leave out what no point of the source can fall on; refuse what is still too wide for a grid."""
+    """Discard target points that no source point can reach; refuse what is still too wide for a grid."""
     longest = np.hypot(*source.T).max() + 1.2 * np.hypot(*reach[:2]) + 4.0 * cell
     target = target[np.hypot(*(target - guess[:2]).T) <= longest]
     sides = np.ptp(target, axis=0) if len(target) else np.zeros(2)
     if np.prod(sides / cell + 8.0) > _MAX_CELLS:
         raise OdometryError(
-            f"source and target cloud: points reach over {sides[0]:.0f} m x {sides[1]:.0f} m, too far for cells of "
+            f"source and target cloud: points extend over {sides[0]:.0f} m x {sides[1]:.0f} m, too far for cells of "
             f"{cell} m; remove stray points"
         )
     return target
@@ -439,7 +439,7 @@ def _choose(points: np.ndarray, n: int) -> np.ndarray:
 
 @compiled
 def _to_cell(x):
-    """Number of the 1 m cell along one axis; farther than any cloud reaches, all are the same."""
+    """Number the 1 m cell along one axis; coordinates beyond 1e15 m share the outermost cell."""
     return np.int64(np.floor(min(max(x, -1e15), 1e15)))
 
 
@@ -507,7 +507,7 @@ def _find_nearest(x, y, target, limit):
 
 @compiled
 def _pair(pose, source, target, limit):
-    """Move points and pair them: those with a neighbour, its index, and the squared distance."""
+    """Move points and pair them: the points with a neighbour, its index, and the squared distance."""
     moved, matched = np.empty_like(source), np.empty(len(source), np.int64)
     squares, c, s, n = np.empty(len(source)), np.cos(pose[2]), np.sin(pose[2]), 0
     for k in range(len(source)):
@@ -520,9 +520,9 @@ def _pair(pose, source, target, limit):
 
 
 @compiled
-def _find_closest(squares, share):
-    """Indices of the smallest values, a share of them."""
-    n = int(np.ceil(share * len(squares)))
+def _find_closest(squares, fraction):
+    """Select the indices of the smallest values, the given fraction of them."""
+    n = int(np.ceil(fraction * len(squares)))
     if n == len(squares):
         return np.arange(n)
     bound = np.partition(squares, n - 1)[n - 1] if n else 0.0
@@ -555,7 +555,7 @@ def _fit_rigid(source, target, rows, matched):
 
 @compiled
 def _iterate_icp(source, target, pose, limits, stops):
-    """Pair and fit in turns: what `IcpResult` holds, in its order."""
+    """Alternate pairing and fitting; return the fields of `IcpResult` in their order."""
     limit, (trim, max_iterations, tolerance, min_matched) = limits[0], stops
     n_matched, rmse_m = 0, np.nan
     for iteration in range(1, max_iterations + 1):
@@ -579,7 +579,7 @@ def _iterate_icp(source, target, pose, limits, stops):
 
 @compiled
 def _weigh_directions(target, matched):
-    """See `IcpResult.weakest_direction`; from at most 100 of the matched points."""
+    """Compute `IcpResult.weakest_direction` from at most 100 of the matched points."""
     total, even, slanted = 0.0, 0.0, 0.0  # xx + yy, xx - yy and 2 xy of the sum of the weights
     for m in range(0, len(matched), len(matched) // 100 + 1):
         n, xx, yy, xy = _spread_about(target, target.points[matched[m]], 2.0, len(target.points))
@@ -596,7 +596,7 @@ def _weigh_directions(target, matched):
 
 @compiled
 def _spread_about(target, centre, radius, most):
-    """Number, variances and covariance (n, xx, yy, xy) of the nearest points within a radius, not many more than most."""
+    """Compute number, variances and covariance (n, xx, yy, xy) of the ``most`` nearest points within a radius."""
     near, n, x, y, xx, yy, xy = _find_near(target, centre, radius), 0, 0.0, 0.0, 0.0, 0.0, 0.0
     bound = np.partition(near[:, 2], most - 1)[most - 1] if len(near) > most else np.inf
     for k in range(len(near)):
@@ -609,7 +609,7 @@ def _spread_about(target, centre, radius, most):
 
 @compiled
 def _find_near(target, centre, radius):
-    """Offsets and squared distances (u, v, square) of the points nearer than a radius, shape (n, 3)."""
+    """Collect offsets and squared distances (u, v, square) of the points within a radius, shape (n, 3)."""
     points, starts, _ = target
     width, found, n = np.int64(np.sqrt(len(starts) - 1)), np.empty((32, 3)), 0
     i, j = _to_cell(centre[0] - radius), _to_cell(centre[1] - radius)
@@ -1070,7 +1070,7 @@ def _check_stamps(stamps_us: np.ndarray) -> np.ndarray:
 
 @compiled
 def _line_metrics(cloud, radius, ratio, along_weight):
-    """Weights of offsets from each point of a map, by the shape of its surroundings, shape (n, 2, 2)."""
+    """Weight offsets from each map point by the shape of its surroundings, shape (n, 2, 2)."""
     metrics = np.empty((len(cloud.points), 2, 2))
     for k in range(len(metrics)):
         n, xx, yy, xy = _spread_about(cloud, cloud.points[k], radius, 12)
@@ -1109,6 +1109,6 @@ def _sum_equations(pose, source, target, metrics, scales):
 
 
 def _solve(equations: np.ndarray) -> np.ndarray | None:
-    """Motion (x, y, yaw) that lowers the weighted errors most; None if it is not fixed."""
+    """Solve for the motion (x, y, yaw) with the least weighted errors; None if it is not constrained."""
     values, directions = np.linalg.eigh(equations[:, :3])
     return None if values[0] <= 1e-12 * values[2] else -directions @ (equations[:, 3] @ directions / values)
