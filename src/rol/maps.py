@@ -81,7 +81,8 @@ def accumulate_map(
         2020, Sec. IV-A.
     """
     poses, n_clouds, waiting, n_waiting = check_poses(poses), 0, [], 0
-    cells = np.array([np.iinfo(np.int64).max]), np.zeros((1, 2)), np.zeros(1, dtype=np.int64)  # an end mark
+    end_mark = np.iinfo(np.int64).max
+    cells = [np.array([end_mark]), np.zeros(1), np.zeros(1), np.zeros(1, np.int32)]
     for i, cloud in enumerate(clouds):
         if i >= len(poses):
             raise MapError(f"more clouds than the {len(poses)} poses")
@@ -90,30 +91,33 @@ def accumulate_map(
         waiting.append(thin_points(transform_points(poses[i], np.reshape(cloud, (-1, 2))), cell)[0])
         n_clouds, n_waiting = n_clouds + 1, n_waiting + len(waiting[-1])
         if n_waiting > _WAITING_POINTS:  # memory grows with the map, not with the clouds
-            cells, waiting, n_waiting = _add_points(*cells, np.concatenate(waiting), cell), [], 0
+            _add_points(cells, np.concatenate(waiting), cell)
+            waiting, n_waiting = [], 0
     if n_clouds != len(poses):
         raise MapError(f"{n_clouds} clouds for {len(poses)} poses")
-    _, sums, hits = _add_points(*cells, np.concatenate([np.zeros((0, 2)), *waiting]), cell)
+    _add_points(cells, np.concatenate([np.zeros((0, 2)), *waiting]), cell)
+    _, *sums, hits = cells
     is_kept = hits >= max(min_hits, 1)
     if not is_kept.any():
         raise MapError(f"the map is empty: no cell is hit by {min_hits} of {len(poses)} clouds")
-    return sums[is_kept] / hits[is_kept, None]
+    return np.stack([values[is_kept] for values in sums], axis=1) / hits[is_kept, None]
 
 
-def _add_points(
-    keys: np.ndarray, sums: np.ndarray, hits: np.ndarray, points: np.ndarray, cell: float
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Add points to the sums and numbers of points of their cells, which are sorted by key; the last is an end mark."""
+def _add_points(cells: list[np.ndarray], points: np.ndarray, cell: float) -> None:
+    """Add points to their cells (in place): keys in rising order, sums of x and of y, numbers of points.
+
+    The arrays are replaced one by one, so that only one of them is there twice; the last cell is an end mark.
+    """
     indices = np.floor(points / cell).astype(np.int64)
     own = (indices[:, 0] << 32) + indices[:, 1]
     found = np.unique(own)
-    at = np.searchsorted(keys, found)
-    at, new = at[keys[at] != found], found[keys[at] != found]
-    keys, sums, hits = np.insert(keys, at, new), np.insert(sums, at, 0.0, axis=0), np.insert(hits, at, 0)
-    places = np.searchsorted(keys, own)
-    np.add.at(sums, places, points)
-    np.add.at(hits, places, 1)
-    return keys, sums, hits
+    at = np.searchsorted(cells[0], found)
+    is_new = cells[0][at] != found
+    for k, values in enumerate((found[is_new], 0.0, 0.0, 0)):
+        cells[k] = np.insert(cells[k], at[is_new], values)
+    places = np.searchsorted(cells[0], own)
+    for k, values in enumerate((points[:, 0], points[:, 1], 1), start=1):
+        np.add.at(cells[k], places, values)
 
 
 @dataclass(frozen=True)
