@@ -29,6 +29,7 @@ TRAIN, LOCALIZE = SESSIONS[0], SESSIONS[1:]
 RUNS = chapters.all_runs(config)
 PARAMETERS = {run: chapters.run_parameters(config, run) for run in RUNS}  # a name that a notebook lacks ends here
 DIGESTS = {chapter: chapters.chapter_digest(NOTEBOOKS / f"{chapter}.ipynb") for chapter in chapters.CHAPTERS}
+TRANSLATION = chapters.translation(config)  # network and options of the generated images, those of chapter 05
 RECIPES = (config["virtual"] or {}).get("sessions", {})
 SHIPPED = [str(path) for path in sorted(Path("data/weights").glob("*.safetensors"))]  # networks that come with the book
 PYTHON, JUPYTER_BOOK = sys.executable, Path(sys.executable).with_name("jupyter-book")
@@ -176,6 +177,7 @@ rule ground_removal:
     output:
         notebook=executed("03_ground_removal"),
         pairs=OUT + "/pairs/{session}/pairs.json",
+        corrected=OUT + "/pairs-corrected/{session}/pairs.json",
     log:
         **logs("03_ground_removal"),
     params:
@@ -206,23 +208,42 @@ rule pix2pix:
         PAPERMILL
 
 
+rule generated_images:
+    input:
+        pairs=OUT + "/pairs/{session}/pairs.json",
+        weights=TRANSLATION["weights"],
+    output:
+        OUT + "/fake/{session}/fake.json",
+    log:
+        OUT + "/logs/generated_images/{session}.log",
+    params:
+        options=TRANSLATION["options"],
+        code=chapters.script_digest("generate_images.py"),
+    priority: 1  # chapter 07 waits for it, and it needs no earlier chapter but 02 and 03
+    message:
+        "generated images, {wildcards.session}"
+    shell:
+        ENVIRONMENT + "OMP_NUM_THREADS={threads} {PYTHON} workflow/generate_images.py "
+        + OUT + "/pairs/{wildcards.session} {input.weights} " + OUT + "/fake/{wildcards.session} "
+        "--threads {threads} {params.options} > {log} 2>&1 || {{ tail -n 30 {log}; exit 1; }}"
+
+
 rule real_vs_fake:
     input:
         notebook=source("05_real_vs_fake"),
         pairs=expand(OUT + "/pairs/{session}/pairs.json", session=SESSIONS),
+        corrected=expand(OUT + "/pairs-corrected/{session}/pairs.json", session=LOCALIZE),
+        fake=expand(OUT + "/fake/{session}/fake.json", session=SESSIONS),
         weights=f"{OUT}/pix2pix/generator.safetensors",
         shipped=SHIPPED,
     output:
         notebook=executed("05_real_vs_fake"),
-        fake=expand(OUT + "/fake/{session}/fake.json", session=SESSIONS),
-        corrected=expand(OUT + "/fake-corrected/{session}/fake.json", session=LOCALIZE),
         similarity=expand(OUT + "/similarity/{session}.json", session=SESSIONS),
     log:
         **logs("05_real_vs_fake"),
     params:
         arguments=arguments("05_real_vs_fake"),
         code=DIGESTS["05_real_vs_fake"],
-    threads: 2
     message:
         "05 real against fake"
     shell:
@@ -254,7 +275,7 @@ rule localization:
     input:
         notebook=source("07_localization"),
         fake=OUT + "/fake/{session}/fake.json",
-        corrected=OUT + "/fake-corrected/{session}/fake.json",
+        corrected=OUT + "/pairs-corrected/{session}/pairs.json",
         summary=f"{OUT}/maps/summary.json",
         map=f"{OUT}/maps/{TRAIN}.npz",
         truth=OUT + "/ground_truth/{session}.tum",

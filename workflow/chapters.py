@@ -199,6 +199,25 @@ def run_parameters(config: dict, run: Run, notebooks: Path = NOTEBOOKS) -> dict:
     return {key: value for key, value in (common | own).items() if key in known}
 
 
+def translation(config: dict, notebooks: Path = NOTEBOOKS) -> dict[str, str]:
+    """Give the network that generates the images and the options of `generate_images.py`, as chapter 05 has them.
+
+    Returns
+    -------
+    translation : dict
+        ``weights``: file of the network; ``options``: arguments, quoted for the shell.
+    """
+    chapter = "05_real_vs_fake"
+    known = notebook_parameters(notebooks / f"{chapter}.ipynb") | run_parameters(
+        config, Run(chapter), notebooks
+    )
+    weights = Path(known["weights_root"], f"{known['network']}.safetensors")
+    if known["network"] == "chapter 04":
+        weights = Path(config["out_dir"], "pix2pix", "generator.safetensors")
+    options = ["--threshold", str(known["threshold"]), "--device", known["device"]]
+    return {"weights": str(weights), "options": shlex.join(options + ["--bf16"] * bool(known["bf16"]))}
+
+
 def papermill_arguments(parameters: dict) -> str:
     """Write parameters as papermill's arguments, quoted for the shell.
 
@@ -298,6 +317,12 @@ def virtual_digest() -> str:
     """Give the digest of all code that makes virtual sessions."""
     files = module_files(["import rol.virtual.__main__"])
     return digest(code_text(file.read_text()) for file in files)
+
+
+def script_digest(name: str) -> str:
+    """Give the digest of a script of the workflow and of the modules it uses."""
+    script = (ROOT / "workflow" / name).read_text()
+    return digest(code_text(text) for text in [script, *(f.read_text() for f in module_files([script]))])
 
 
 def stored_digest(notebook: nbformat.NotebookNode, config: dict) -> str:
