@@ -103,8 +103,8 @@ def test_profile_plans_all_jobs(name: str, tmp_path: Path) -> None:
     plan = answer.stdout + answer.stderr
     runs = len(chapters.all_runs(chapters.load_config(ROOT / "config/smoke.yaml")))
     assert re.search(
-        rf"^total +{runs + 5 + 1}$", plan, flags=re.MULTILINE
-    )  # five sessions to make, and the book
+        rf"^total +{runs + 5 + 5 + 1}$", plan, flags=re.MULTILINE
+    )  # five sessions to make, their generated images, and the book
 
 
 def test_page_shows_the_profiles_as_they_are() -> None:
