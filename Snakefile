@@ -217,15 +217,16 @@ rule generated_images:
     log:
         OUT + "/logs/generated_images/{session}.log",
     params:
+        pairs=OUT + "/pairs/{session}",
+        out=OUT + "/fake/{session}",
         options=TRANSLATION["options"],
         code=chapters.script_digest("generate_images.py"),
-    priority: 1  # chapter 07 waits for it, and it needs no earlier chapter but 02 and 03
+    priority: 1
     message:
         "generated images, {wildcards.session}"
     shell:
-        ENVIRONMENT + "OMP_NUM_THREADS={threads} {PYTHON} workflow/generate_images.py "
-        + OUT + "/pairs/{wildcards.session} {input.weights} " + OUT + "/fake/{wildcards.session} "
-        "--threads {threads} {params.options} > {log} 2>&1 || {{ tail -n 30 {log}; exit 1; }}"
+        ENVIRONMENT + "OMP_NUM_THREADS={threads} {PYTHON:q} workflow/generate_images.py {params.pairs:q} {input.weights:q} "
+        "{params.out:q} --threads {threads} {params.options} > {log:q} 2>&1 || {{ tail -n 30 {log:q}; exit 1; }}"
 
 
 rule real_vs_fake:
@@ -244,6 +245,7 @@ rule real_vs_fake:
     params:
         arguments=arguments("05_real_vs_fake"),
         code=DIGESTS["05_real_vs_fake"],
+    priority: 1
     message:
         "05 real against fake"
     shell:
@@ -324,6 +326,7 @@ rule oxford_route:
     params:
         arguments=arguments("09_oxford_route"),
         code=DIGESTS["09_oxford_route"],
+    priority: -1  # needs no other chapter, so it fills gaps
     message:
         "09 the real route"
     shell:
@@ -361,6 +364,7 @@ rule ablations:
     params:
         arguments=arguments("11_ablations"),
         code=DIGESTS["11_ablations"],
+    priority: -1
     message:
         "11 ablations"
     shell:
@@ -378,6 +382,7 @@ rule performance:
     params:
         arguments=arguments("12_performance"),
         code=DIGESTS["12_performance"],
+    priority: -1
     message:
         "12 performance"
     shell:
