@@ -31,8 +31,7 @@ $(STAMP):
 	@workflow/set_up.sh .venv $@
 
 book: $(STAMP)
-	@$(SNAKEMAKE) --unlock --quiet all
-	@time $(SNAKEMAKE) book --prioritize pix2pix --rerun-incomplete --retries 1 --scheduler greedy --quiet host reason
+	@time $(SNAKEMAKE) book --nolock --prioritize pix2pix --rerun-incomplete --retries 1 --scheduler greedy --quiet host reason
 	@echo "The book: $$($(BIN)/python workflow/stage_book.py --where config/$(PROFILE).yaml) (open it in a browser, no network needed)"
 
 test: $(STAMP) lint

@@ -15,6 +15,7 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(workflow.basedir, "workflow")))
 import chapters
+import run_lock
 from chapters import NOTEBOOKS, Run
 from snakemake_interface_common.exceptions import WorkflowError
 
@@ -22,6 +23,8 @@ if not workflow.configfiles:
     configfile: "config/demo.yaml"
 
 CONFIG_FILE = os.path.relpath(workflow.configfiles[-1])
+if workflow.is_main_process and not workflow.output_settings.dryrun:
+    run_lock.wait_for_lock(".snakemake/run.lock", CONFIG_FILE)
 chapters.check_config(config, CONFIG_FILE)
 SESSIONS_ROOT, OUT, BOOK = config["sessions_root"], config["out_dir"], config["book_dir"]
 SESSIONS, METHODS = config["sessions"], config["methods"]
@@ -36,12 +39,12 @@ PYTHON, JUPYTER_BOOK = sys.executable, Path(sys.executable).with_name("jupyter-b
 
 # One job uses the threads it was given and no more, and threads that wait leave the processor to others.
 # Figures go into the notebook, whatever the caller's environment says.
-ENVIRONMENT = "env -u JPY_SESSION_NAME NUMBA_NUM_THREADS={threads} OMP_WAIT_POLICY=PASSIVE PYTHONHASHSEED=0 MPLBACKEND=module://matplotlib_inline.backend_inline "
+ENVIRONMENT = "env -u JPY_SESSION_NAME NUMBA_NUM_THREADS={threads} OMP_WAIT_POLICY=PASSIVE PYTHONHASHSEED=0 PYTHONUTF8=1 MPLBACKEND=module://matplotlib_inline.backend_inline "
 # papermill writes to the log, since Snakemake deletes the outputs of a failed job, and a traceback with it.
 PAPERMILL = ENVIRONMENT + (
-    "{PYTHON} -m papermill {input.notebook} {log.notebook} --kernel python3 --no-progress-bar {params.arguments} "
-    "> {log.text} 2>&1 && cp {log.notebook} {output.notebook} "
-    "|| {{ tail -n 30 {log.text}; echo 'the failed notebook, with its traceback: {log.notebook}'; exit 1; }}"
+    "{PYTHON:q} -m papermill {input.notebook:q} {log.notebook:q} --kernel python3 --no-progress-bar {params.arguments} "
+    "> {log.text:q} 2>&1 && cp {log.notebook:q} {output.notebook:q} "
+    "|| {{ tail -n 30 {log.text:q}; echo the failed notebook, with its traceback: {log.notebook:q}; exit 1; }}"
 )
 
 
@@ -107,9 +110,9 @@ rule book:
     message:
         "the book in {BOOK}"
     shell:
-        "{PYTHON} workflow/stage_book.py {CONFIG_FILE} > {log} 2>&1 "
-        "&& {JUPYTER_BOOK} build {BOOK} --all -W -n --keep-going >> {log} 2>&1 "
-        "|| {{ grep -E 'WARNING|ERROR|Error' {log} || tail -n 30 {log}; echo 'the whole log: {log}'; exit 1; }}"
+        "{PYTHON:q} workflow/stage_book.py {CONFIG_FILE:q} > {log:q} 2>&1 "
+        "&& {JUPYTER_BOOK:q} build {BOOK:q} --all -W -n --keep-going >> {log:q} 2>&1 "
+        "|| {{ grep -E 'WARNING|ERROR|Error' {log:q} || tail -n 30 {log:q}; echo the whole log: {log:q}; exit 1; }}"
 
 
 rule chapters:
@@ -125,13 +128,14 @@ rule virtual_session:
     params:
         recipe=lambda wildcards: json.dumps(recipe(wildcards.session), sort_keys=True),
         code=chapters.virtual_digest(),
+        made=SESSIONS_ROOT + "/{session}",
     message:
         "virtual session {wildcards.session}"
     shell:  # the writer goes on with what is there, which is right after a stop and wrong after a change of its code
-        'made={SESSIONS_ROOT}/{wildcards.session}; [ "$(cat $made.code 2>/dev/null)" = {params.code} ] || rm -rf "$made"; '
-        "echo {params.code} > $made.code; "
-        + ENVIRONMENT + "{PYTHON} -m rol.virtual {CONFIG_FILE} --session {wildcards.session} --out {SESSIONS_ROOT} "
-        "> {log} 2>&1 || {{ tail -n 30 {log}; exit 1; }}"
+        'made={params.made:q}; [ "$(cat "$made.code" 2>/dev/null)" = {params.code} ] || rm -rf "$made"; '
+        'echo {params.code} > "$made.code"; '
+        + ENVIRONMENT + "{PYTHON:q} -m rol.virtual {CONFIG_FILE:q} --session {wildcards.session:q} --out {SESSIONS_ROOT:q} "
+        "> {log:q} 2>&1 || {{ tail -n 30 {log:q}; exit 1; }}"
 
 
 rule sessions:
@@ -201,11 +205,15 @@ rule pix2pix:
     params:
         arguments=arguments("04_pix2pix"),
         code=DIGESTS["04_pix2pix"],
+        checkpoint=f"{OUT}/pix2pix/checkpoint",
     threads: 1  # a second one makes it hardly quicker, and has other chapters to run
     message:
         "04 pix2pix: training"
-    shell:
-        PAPERMILL
+    shell:  # continues from the checkpoint of a stopped run; one of other code, parameters or pairs is set aside
+        'kept={params.checkpoint:q}; run=$(echo {params.code} {params.arguments:q} | cat - {input.pairs:q} | cksum); '
+        'if [ "$(cat "$kept/run.txt" 2>/dev/null)" != "$run" ]; then '
+        'if [ -d "$kept" ]; then rm -rf "$kept-before"; mv "$kept" "$kept-before"; fi; '
+        'mkdir -p "$kept"; echo "$run" > "$kept/run.txt"; fi; ' + PAPERMILL
 
 
 rule generated_images:

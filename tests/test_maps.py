@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from rol import maps
 from rol.geometry import compose, invert, transform_points
 from rol.maps import (
     MapError,
@@ -14,6 +15,8 @@ from rol.maps import (
     thin_points,
     to_first_map,
 )
+
+add_points = maps._add_points
 
 
 def street_map(rng: np.random.Generator) -> np.ndarray:
@@ -45,6 +48,18 @@ def test_accumulate_map_counts_clouds_and_not_points():
     points = accumulate_map(clouds, poses, cell=0.5, min_hits=2)
     np.testing.assert_allclose(points, [[5.1, 0.1]], atol=1e-9)
     assert len(accumulate_map(clouds, poses, cell=0.5, min_hits=1)) == 2
+
+
+def test_accumulate_map_in_parts_gives_the_same_bits(monkeypatch):
+    rng = np.random.default_rng(5)
+    poses = np.column_stack([rng.uniform(-50, 50, (40, 2)), rng.uniform(-3, 3, 40)])
+    clouds = [rng.uniform(-20.0, 20.0, (rng.integers(0, 300), 2)) for _ in poses]
+    at_once = accumulate_map(clouds, poses, cell=0.5, min_hits=2)
+    monkeypatch.setattr(maps, "_WAITING_POINTS", 50)
+    added = []
+    monkeypatch.setattr(maps, "_add_points", lambda *given: added.append(given) or add_points(*given))
+    np.testing.assert_array_equal(accumulate_map(iter(clouds), poses, cell=0.5, min_hits=2), at_once)
+    assert len(added) > 3 and len(at_once) > 50
 
 
 def test_accumulate_map_takes_empty_clouds_and_refuses_an_empty_map():

@@ -1,6 +1,9 @@
 """The loop learns, repeats itself to the last bit, goes on where it stopped, and refuses what it must."""
 
+from collections.abc import Iterator
 from dataclasses import replace
+from functools import partial
+from itertools import count
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +12,7 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
+from rol import training
 from rol.pix2pix import TrainConfig, generate, load_metadata, load_weights
 from rol.training import TrainingError, learning_rate, pick_pairs, train
 
@@ -86,6 +90,34 @@ def test_stopped_run_goes_on_to_the_same_bits(tmp_path: Path, stop_at: int) -> N
     pd.testing.assert_frame_equal(history, again, check_exact=True)
     for name, value in whole.state_dict().items():
         assert torch.equal(value, resumed.state_dict()[name])
+    for file in ("generator.safetensors", "checkpoint/last.safetensors", "history.csv"):
+        assert (tmp_path / "whole" / file).read_bytes() == (tmp_path / "stopped" / file).read_bytes()
+
+
+@pytest.mark.parametrize(("last_look", "saved_step"), [(4, 2), (7, 4), (8, 4), (10, 6)])
+def test_checkpoints_by_time_within_a_row_lead_to_the_same_bits(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, last_look: int, saved_step: int
+) -> None:
+    """Every look at the clock takes a minute; a row of the history has five steps, a checkpoint by steps comes after ten."""
+    config, pairs = replace(TINY, report_every=5, checkpoint_every=10), make_pairs()
+    settings = {"seed": 3, "held_out": make_pairs(2, seed=8), "checkpoint_minutes": 2.0}
+    whole = train(pairs, config, tmp_path / "whole", **settings)[1]
+
+    def clock(looks: Iterator[int]) -> float:
+        minute = next(looks)
+        if minute == last_look:
+            raise KeyboardInterrupt
+        return 60.0 * minute
+
+    monkeypatch.setattr(training, "monotonic", partial(clock, count()))
+    with pytest.raises(KeyboardInterrupt):
+        train(pairs, config, tmp_path / "stopped", **settings)
+    about = load_metadata(tmp_path / "stopped" / "checkpoint" / "last.safetensors")
+    assert (about["step"], len(about["history"])) == (saved_step, saved_step // 5)
+    monkeypatch.undo()
+    again = train(pairs, config, tmp_path / "stopped", **settings)[1]
+    assert again["step"].tolist() == [5, 10, 12]
+    pd.testing.assert_frame_equal(whole, again, check_exact=True)
     for file in ("generator.safetensors", "checkpoint/last.safetensors", "history.csv"):
         assert (tmp_path / "whole" / file).read_bytes() == (tmp_path / "stopped" / file).read_bytes()
 

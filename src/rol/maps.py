@@ -22,6 +22,9 @@ except ImportError:  # this file was copied on its own
     from geometry import check_poses, compose, transform_points
 
 
+_WAITING_POINTS = 100_000  # fewest points that are added to a map at once
+
+
 class MapError(ValueError):
     """Raised for maps without points and for clouds that do not fit their poses."""
 
@@ -75,21 +78,34 @@ def accumulate_map(
         If there are more or fewer clouds than poses, a point is not finite, or no cell is left. Yin et al.
         2020, Sec. IV-A.
     """
-    poses, thinned = check_poses(poses), []
+    poses, n_clouds, waiting, n_waiting = check_poses(poses), 0, [], 0
+    cells, sums, hits = np.zeros((0, 2), dtype=np.int64), np.zeros((0, 2)), np.zeros(0)
     for i, cloud in enumerate(clouds):
         if i >= len(poses):
             raise MapError(f"more clouds than the {len(poses)} poses")
         if not np.isfinite(cloud).all():
             raise MapError(f"cloud {i} holds a point that is not finite")
-        thinned.append(thin_points(transform_points(poses[i], np.reshape(cloud, (-1, 2))), cell)[0])
-    if len(thinned) != len(poses):
-        raise MapError(f"{len(thinned)} clouds for {len(poses)} poses")
-    points = np.concatenate(thinned) if thinned else np.zeros((0, 2))
-    _, inverse, hits = _unique_cells(points, cell)
+        waiting.append(thin_points(transform_points(poses[i], np.reshape(cloud, (-1, 2))), cell)[0])
+        n_clouds, n_waiting = n_clouds + 1, n_waiting + len(waiting[-1])
+        if n_waiting > max(len(cells), _WAITING_POINTS):  # memory grows with the map, not with the clouds
+            cells, sums, hits = _add_points(cells, sums, hits, np.concatenate(waiting), cell)
+            waiting, n_waiting = [], 0
+    if n_clouds != len(poses):
+        raise MapError(f"{n_clouds} clouds for {len(poses)} poses")
+    cells, sums, hits = _add_points(cells, sums, hits, np.concatenate([np.zeros((0, 2)), *waiting]), cell)
     if not (hits >= min_hits).any():
         raise MapError(f"the map is empty: no cell is hit by {min_hits} of {len(poses)} clouds")
-    sums = np.stack([np.bincount(inverse, points[:, k], len(hits)) for k in range(2)], axis=1)
     return (sums / hits[:, None])[hits >= min_hits]
+
+
+def _add_points(
+    cells: np.ndarray, sums: np.ndarray, hits: np.ndarray, points: np.ndarray, cell: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Add points to the sums and numbers of points of their cells."""
+    known, inverse, _ = _unique_cells(np.concatenate([(cells + 0.5) * cell, points]), cell)
+    values, counts = np.concatenate([sums, points]), np.concatenate([hits, np.ones(len(points))])
+    sums = np.stack([np.bincount(inverse, values[:, k], len(known)) for k in range(2)], axis=1)
+    return known, sums, np.bincount(inverse, counts, len(known))
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,7 @@
 """The training room: the loop around `rol.pix2pix.train_step`, its history, and checkpoints to go on from.
 
-Nothing here is remembered but in the checkpoint: the order of the pairs and the learning rate follow from the
-seed and the number of the step. So a run that was stopped goes on to the very losses of one that was not.
+The checkpoint is the only state: the order of the pairs and the learning rate follow from the seed and the number of
+the step. A run that was stopped therefore ends with the same losses as one that was not.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict
 from pathlib import Path
+from time import monotonic
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -33,6 +34,15 @@ class TrainingError(ValueError):
 
 class TrainingState:
     """Everything that changes during training: two networks, two optimisers, the step, the history.
+
+    Attributes
+    ----------
+    step : int
+        Steps taken so far.
+    history : list of dict
+        Finished rows of the history.
+    sums : dict
+        Sums of the losses of the row that is under way, by name.
 
     Parameters
     ----------
@@ -62,6 +72,14 @@ class TrainingState:
         }
         self.step = 0
         self.history: list[dict[str, float]] = []
+        self.sums: dict[str, float] = {}
+
+    def end_row(self, steps_per_epoch: int, rate: float) -> None:
+        """Append a row of the mean losses since the last one to the history."""
+        n = self.step - (self.history[-1]["step"] if self.history else 0)
+        row = {"step": self.step, "epoch": self.step / steps_per_epoch, "learning_rate": rate}
+        self.history.append(row | {name: total / n for name, total in self.sums.items()})
+        self.sums = {}
 
     @property
     def parts(self) -> list[Any]:
@@ -78,7 +96,8 @@ class TrainingState:
             tensors |= {f"{name}.{key}": value for key, value in network.state_dict().items()}
             for index, state in self.optimizers[name].state_dict()["state"].items():
                 tensors |= {f"adam.{name}.{index}.{key}": value for key, value in state.items()}
-        save_tensors(path, tensors, {**about, "step": self.step, "history": self.history})
+        scalars = {"step": self.step, "history": self.history, "sums": self.sums}
+        save_tensors(path, tensors, {**about, **scalars})
 
     def load(self, path: Path, about: dict[str, Any]) -> None:
         """Go back to a checkpoint of the same run; refuse the checkpoint of another."""
@@ -86,7 +105,9 @@ class TrainingState:
 
         tensors, found = load_tensors(path)
         for name, (then, now) in _differences(found, about).items():
-            raise TrainingError(f"{path}: is of another run: {name} was {then}, now {now}")
+            raise TrainingError(
+                f"{path}: is of another run: {name} was {then}, now {now}; delete it, or train with resume=False"
+            )
         for name, network in self.networks.items():
             network.load_state_dict({key: tensors[f"{name}.{key}"] for key in network.state_dict()})
             states = {}
@@ -98,7 +119,7 @@ class TrainingState:
                 states[index] = {"step": tensors[prefix + "step"], **moments}
             optimizer = self.optimizers[name]
             optimizer.load_state_dict({**optimizer.state_dict(), "state": states})
-        self.step, self.history = found["step"], found["history"]
+        self.step, self.history, self.sums = found["step"], found["history"], found["sums"]
 
 
 def learning_rate(step: int, n_steps: int, first: float) -> float:
@@ -155,6 +176,7 @@ def train(
     metadata: dict[str, Any] | None = None,
     on_report: Callable[[dict[str, float], ResnetGenerator | UnetGenerator], None] | None = None,
     loaders: int = 1,
+    checkpoint_minutes: float = 10.0,
 ) -> tuple[ResnetGenerator | UnetGenerator, pd.DataFrame]:
     """Train both networks; stop at any time and call again to go on from the last checkpoint.
 
@@ -183,6 +205,8 @@ def train(
         Called with each new row of the history and the generator, to print or to keep samples.
     loaders : int
         Threads that load pairs ahead.
+    checkpoint_minutes : float
+        Longest time without a checkpoint [min], beside one every ``config.checkpoint_every`` steps.
 
     Returns
     -------
@@ -212,19 +236,26 @@ def train(
     generator.image_size = _image_size(dataset, generator.size_step)
     if resume and checkpoint.is_file():
         state.load(checkpoint, about)
+    saved_s = monotonic()
     while state.step < n_steps:
         generator.train()
         try:
-            row = _train_some(state, dataset, config, seed, loaders)
+            for _ in _train_row(state, dataset, config, seed, loaders):
+                if monotonic() - saved_s >= 60.0 * checkpoint_minutes:
+                    state.save(checkpoint, about)
+                    saved_s = monotonic()
         except TrainingError as error:
             kept = f"{checkpoint} stays as it is" if checkpoint.is_file() else "there is no checkpoint yet"
             raise TrainingError(f"{error}; {kept}") from error
-        row["held_out_l1"] = evaluate_l1(generator, held_out)
-        state.history.append(row)
+        state.end_row(
+            -(-len(dataset) // config.batch), learning_rate(state.step - 1, n_steps, config.learning_rate)
+        )
+        state.history[-1]["held_out_l1"] = evaluate_l1(generator, held_out)
         if on_report is not None:
-            on_report(row, generator)
+            on_report(state.history[-1], generator)
         if state.step % config.checkpoint_every == 0 or state.step == n_steps:
             state.save(checkpoint, about)
+            saved_s = monotonic()
     history = pd.DataFrame(state.history, columns=HISTORY_COLUMNS)
     temporary = folder / f".history.csv.{os.getpid()}.tmp"
     history.to_csv(temporary, index=False)
@@ -287,31 +318,30 @@ def score_points(
     return by_threshold.mean().join(by_threshold.std().add_suffix("_sd")).reset_index()
 
 
-def _train_some(
+def _train_row(
     state: TrainingState, dataset: Any, config: TrainConfig, seed: int, loaders: int
-) -> dict[str, float]:
-    """Take the steps of one row of the history and average their losses."""
+) -> Iterator[int]:
+    """Take the steps that are left of the row of the history under way; yield the number taken so far after each."""
     from .pix2pix import Pix2PixError, train_step
 
-    n_steps, losses = config.n_steps(len(dataset)), []
+    n_steps = config.n_steps(len(dataset))
     device = next(state.networks["generator"].parameters()).device
-    steps = range(state.step, min(state.step + config.report_every, n_steps))
+    steps = range(state.step, min((len(state.history) + 1) * config.report_every, n_steps))
     for step, (radar, lidar) in zip(steps, _load_ahead(dataset, config, seed, steps, loaders), strict=True):
         rate = learning_rate(step, n_steps, config.learning_rate)
         for optimizer in state.optimizers.values():
             optimizer.param_groups[0]["lr"] = rate
         try:
-            losses.append(train_step(*state.parts, radar.to(device), lidar.to(device), config))
+            losses = train_step(*state.parts, radar.to(device), lidar.to(device), config)
         except Pix2PixError as error:
             batch = pick_pairs(step, len(dataset), config.batch, seed)
             names = ", ".join(
                 dataset.name(int(i)) if hasattr(dataset, "name") else f"pair {i}" for i in batch
             )
             raise TrainingError(f"step {step + 1} of {n_steps}, batch of {names}: {error}") from error
+        state.sums = {name: state.sums.get(name, 0.0) + loss for name, loss in losses.items()}
         state.step = step + 1
-    means = {name: float(np.mean([loss[name] for loss in losses])) for name in losses[0]}
-    epoch = state.step / -(-len(dataset) // config.batch)
-    return {"step": state.step, "epoch": epoch, "learning_rate": rate, **means}
+        yield state.step
 
 
 def _load_ahead(
