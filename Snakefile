@@ -353,7 +353,6 @@ rule real_radar:
     params:
         arguments=arguments("10_real_radar"),
         code=DIGESTS["10_real_radar"],
-    threads: 2
     message:
         "10 real radar"
     shell:
