@@ -13,6 +13,8 @@ SHELL := bash
 .DEFAULT_GOAL := help
 .PHONY: help setup book test notebooks weights judge real lint format clean
 
+# UTF-8 whatever the locale is, also in the tools that are called.
+export PYTHONUTF8 := 1
 BIN := .venv/bin
 # The stamp's name is the sum of what is installed, so a changed lock file asks for another stamp.
 STAMP := .venv/set-up-$(shell cat requirements.lock pyproject.toml | cksum | cut -d ' ' -f 1)

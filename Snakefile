@@ -132,7 +132,8 @@ rule virtual_session:
     message:
         "virtual session {wildcards.session}"
     shell:  # the writer goes on with what is there, which is right after a stop and wrong after a change of its code
-        'made={params.made:q}; [ "$(cat "$made.code" 2>/dev/null)" = {params.code} ] || rm -rf "$made"; '
+        'made={params.made:q}; [ "$(cat "$made.code" 2>/dev/null)" = {params.code} ] '
+        """|| ! grep -qs '"format":' "$made/settings.json" || rm -rf "$made"; """
         'echo {params.code} > "$made.code"; '
         + ENVIRONMENT + "{PYTHON:q} -m rol.virtual {CONFIG_FILE:q} --session {wildcards.session:q} --out {SESSIONS_ROOT:q} "
         "> {log:q} 2>&1 || {{ tail -n 30 {log:q}; exit 1; }}"

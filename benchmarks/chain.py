@@ -27,7 +27,7 @@ from filter import open_map
 from translator import ROOT, describe_machine
 
 from rol import mcl, rall
-from rol.evaluation import write_text
+from rol.files import write_text
 from rol.front_ends import Translator, detect_points, load_translator, translate_scan
 from rol.motion import MotionModel, mover
 from rol.odometry import local_map_odometry

@@ -29,6 +29,7 @@ from threadpoolctl import threadpool_limits
 from translator import ROOT, describe_machine, take_turns
 
 from rol import mcl, rall
+from rol.files import write_text
 from rol.geometry import invert, transform_points
 from rol.mcl import MapGrid
 
@@ -232,8 +233,7 @@ def main() -> None:
     for name, row in table.items():
         print(f"{name:30s}", "  ".join(f"{key} {value:.3g}" for key, value in row.items()), flush=True)
     path = ROOT / "data" / "performance" / "filter.json"
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(json.dumps({"about": about, "rows": table}, indent=1) + "\n")
+    write_text(path, json.dumps({"about": about, "rows": table}, indent=1) + "\n")
 
 
 if __name__ == "__main__":

@@ -39,8 +39,9 @@ from translator import ROOT, describe_machine
 
 from rol import rall
 from rol.bev import image_to_points
-from rol.evaluation import KITTI_LENGTHS_M, drift_by_length, pose_errors, read_tum, rmse, write_text
+from rol.evaluation import KITTI_LENGTHS_M, drift_by_length, pose_errors, read_tum, rmse
 from rol.fakes import list_fakes, read_image
+from rol.files import write_text
 from rol.geometry import accumulate_steps, relative_pose
 from rol.odometry import chain, correct_cloud, local_map_odometry
 from rol.radar import KIT_RANGE_RESOLUTION, MEASURED_RANGE_RESOLUTION

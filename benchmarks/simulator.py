@@ -18,6 +18,7 @@ from time import perf_counter
 import numpy as np
 
 from rol import oxford, rall
+from rol.files import write_text
 from rol.virtual import radar_sensor, radar_signal
 from rol.virtual.session import VirtualSession, build_session, make_scan, make_sweep, sensor_settings
 from rol.virtual.settings import load_settings
@@ -98,10 +99,7 @@ def main() -> None:
     for name, value in report.items():
         print(f"{name:22s} {value:,.3f}" if isinstance(value, float) else f"{name:22s} {value}")
     target = ROOT / "build" / "benchmarks" / "simulator.json"
-    target.parent.mkdir(parents=True, exist_ok=True)
-    temporary = target.with_suffix(".tmp")
-    temporary.write_text(json.dumps(report, indent=2) + "\n")
-    temporary.replace(target)
+    write_text(target, json.dumps(report, indent=2) + "\n")
 
 
 if __name__ == "__main__":

@@ -27,6 +27,7 @@ import torch
 from scipy.ndimage import map_coordinates
 
 from rol.bev import image_to_points
+from rol.files import write_text
 from rol.pix2pix import TrainConfig, build_generator, generate, has_bf16, load_weights
 from rol.radar import polar_to_cartesian
 from rol.similarity import nn_distances
@@ -156,7 +157,11 @@ def describe_machine(threads: int) -> dict[str, object]:
     commit = subprocess.run(
         ["git", "rev-parse", "HEAD"], cwd=ROOT, capture_output=True, text=True, check=False
     ).stdout.strip()
-    lines = Path("/proc/cpuinfo").read_text().splitlines() if Path("/proc/cpuinfo").is_file() else []
+    lines = (
+        Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+        if Path("/proc/cpuinfo").is_file()
+        else []
+    )
     model = next((line.split(":")[1].strip() for line in lines if line.startswith("model name")), "")
     return {
         "processor": model or platform.processor() or platform.machine(),
@@ -196,8 +201,7 @@ def main() -> None:
     for name, row in table.items():
         print(name, "  ".join(f"{key} {value:.3g}" for key, value in row.items()), flush=True)
     path = ROOT / "data" / "performance" / "translator.json"
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(json.dumps({"about": about, "rows": table}, indent=1) + "\n")
+    write_text(path, json.dumps({"about": about, "rows": table}, indent=1) + "\n")
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Every file of src/rol, copied alone into an empty folder (with geometry.py beside it), must import there."""
+"""Every file of src/rol, copied into an empty folder with geometry.py and files.py beside it, must import there."""
 
 import shutil
 import subprocess
@@ -28,7 +28,8 @@ print(*(name for name in sys.argv[3:] if name in sys.modules))
 
 @pytest.mark.parametrize("file", FILES, ids=lambda file: file.relative_to(PACKAGE).as_posix())
 def test_file_imports_when_copied_alone(file: Path, tmp_path: Path) -> None:
-    shutil.copy(PACKAGE / "geometry.py", tmp_path)
+    for neighbour in ("geometry.py", "files.py"):
+        shutil.copy(PACKAGE / neighbour, tmp_path)
     shutil.copy(file, tmp_path)
     command = [sys.executable, "-I", "-c", IMPORT_ALONE, str(tmp_path), file.stem, *HEAVY]
     answer = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, check=False)
@@ -41,7 +42,7 @@ def test_file_imports_when_copied_alone(file: Path, tmp_path: Path) -> None:
 def test_nobody_but_virtual_imports_virtual() -> None:
     for file in FILES:
         if file.parent.name != "virtual":
-            text = file.read_text()
+            text = file.read_text(encoding="utf-8")
             assert "from .virtual" not in text and "rol.virtual" not in text, (
                 f"{file.name} imports rol.virtual"
             )

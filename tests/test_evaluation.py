@@ -240,7 +240,7 @@ def test_tum_round_trip(tmp_path):
     stamps_back, poses_back = read_tum(tmp_path / "new" / "a.tum")
     np.testing.assert_array_equal(stamps_back, stamps_us)
     np.testing.assert_allclose(poses_back, estimate, atol=6e-7)
-    first = (tmp_path / "new" / "a.tum").read_text().splitlines()[0].split()
+    first = (tmp_path / "new" / "a.tum").read_text(encoding="utf-8").splitlines()[0].split()
     assert first[0] == "1547120789.640420" and len(first) == 8
     assert [p.name for p in (tmp_path / "new").iterdir()] == ["a.tum"]  # no temporary file is left
 
@@ -250,15 +250,20 @@ def test_tum_round_trip(tmp_path):
     [
         (["1.0 0 0 0 0 0 0 1", "2.0 nan 0 0 0 0 0 1"], "pose 2 is not finite"),
         (["1.0 0 0 0 0 0 0 1", "1.0 0 0 0 0 0 0 1"], "times do not increase at pose 2"),
-        (["1.0 0 0 0 0 0 0"], "pose 1 has 7 values instead of 8"),
+        (["1.0 0 0 0 0 0 0"], "line 1 has 7 values instead of 8"),
         (["1.0 0 0 0 0 0 0 one"], "could not convert"),
         (["# nothing"], "no pose"),
+        (
+            ["# t x y z", "1.0 0 0 0 0 0 0 1", "2.0 0 0 0 0 0 0 0"],
+            "line 3: norm of the quaternion is 0, not 1",
+        ),
+        (["1.0 0 0 0 0 0 0.5 0.5"], "line 1: norm of the quaternion is 0.707, not 1"),
         (["nan 0 0 0 0 0 0 1"], "pose 1 is not finite"),
     ],
 )
 def test_bad_tum_files_are_named(tmp_path, lines, fault):
     path = tmp_path / "bad.tum"
-    path.write_text("\n".join(lines) + "\n")
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
     with pytest.raises(EvaluationError, match=f"bad.tum: .*{fault}"):
         read_tum(path)
 
@@ -306,10 +311,10 @@ def test_bad_metrics_are_refused(tmp_path):
         with pytest.raises(EvaluationError, match=fault):
             write_metrics(path, good | change)
     assert read_metrics(path) == good
-    path.write_text(json.dumps(good)[:40])
+    path.write_text(json.dumps(good)[:40], encoding="utf-8")
     with pytest.raises(EvaluationError, match="metrics.json: not a whole json file"):
         read_metrics(path)
-    path.write_text("[]")
+    path.write_text("[]", encoding="utf-8")
     with pytest.raises(EvaluationError, match="metrics.json: keys missing or unknown"):
         read_metrics(path)
 

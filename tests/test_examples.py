@@ -7,7 +7,10 @@ import ast
 import atexit
 import functools
 import importlib.metadata
+import json
+import os
 import re
+import shlex
 import shutil
 import subprocess
 import sys
@@ -103,7 +106,7 @@ def copy_files(names: Iterable[str], folder: Path) -> None:
 
 def code_blocks(page: Path, section: str) -> list[tuple[str, str]]:
     """Give language and text of the code blocks of a section of the second level."""
-    text = page.read_text().partition(f"\n## {section}\n")[2].partition("\n## ")[0]
+    text = page.read_text(encoding="utf-8").partition(f"\n## {section}\n")[2].partition("\n## ")[0]
     return re.findall(r"^```(\w+)\n(.*?)^```$", text, re.MULTILINE | re.DOTALL)
 
 
@@ -122,7 +125,7 @@ def test_examples_run_with_what_the_page_names(group: list[str], tmp_path: Path)
         (tmp_path / name).mkdir()
         is_in_folder = "from tools." in EXAMPLES[name].code
         copy_files([own, *EXAMPLES[name].files], tmp_path / name / ("tools" if is_in_folder else ""))
-        (tmp_path / name / "example.py").write_text(EXAMPLES[name].code)
+        (tmp_path / name / "example.py").write_text(EXAMPLES[name].code, encoding="utf-8")
     packages = set.union(*(EXAMPLES[name].packages for name in group))
     printed = run_examples([tmp_path / name for name in group], packages)
     assert dict(zip(group, printed, strict=True)) == {name: EXAMPLES[name].printed for name in group}
@@ -144,7 +147,7 @@ def follow_imports(start: Path) -> tuple[set[str], set[str]]:
     left, seen, packages = list(inside), set(inside), set()
     while left:
         file = left.pop()
-        for level, module in runtime_imports(ast.parse(file.read_text())):
+        for level, module in runtime_imports(ast.parse(file.read_text(encoding="utf-8"))):
             base = file.parents[level - 1] if level else file.parent
             target = base / f"{module}.py"
             if target.is_file() and target not in seen:
@@ -177,7 +180,7 @@ def test_mcl_copied_into_an_empty_folder_localizes(tmp_path: Path) -> None:
     blocks = dict(code_blocks(TAKE, "Localize in five lines"))
     assert "{mcl,geometry}.py" in blocks["bash"] and "pip install numpy scipy numba" in blocks["bash"]
     copy_files(["mcl.py", "geometry.py"], tmp_path)
-    (tmp_path / "example.py").write_text(blocks["python"])
+    (tmp_path / "example.py").write_text(blocks["python"], encoding="utf-8")
     [printed] = run_examples([tmp_path], {"numpy", "scipy", "numba"})
     assert printed == blocks["text"]
     mean, worst, by_odometry = map(float, re.findall(r"(\d+\.\d+) m", printed))
@@ -188,7 +191,7 @@ def run_with_package(section: str, folder: Path) -> str:
     """Run the script of a section of the page on radars of one's own, with the package `rol` at hand."""
     blocks = dict(code_blocks(OWN_RADAR, section))
     shutil.copytree(PACKAGE, folder / "rol", ignore=shutil.ignore_patterns("__pycache__"))
-    (folder / "example.py").write_text(blocks["python"])
+    (folder / "example.py").write_text(blocks["python"], encoding="utf-8")
     [printed] = run_examples([folder], PACKAGES.keys() - {"torch", "safetensors", "open3d-cpu", "matplotlib"})
     assert printed == blocks["text"]
     return printed
@@ -199,32 +202,48 @@ def test_radar_of_ones_own_is_localized(tmp_path: Path) -> None:
     assert float(error[1]) < 0.3
 
 
-def test_session_of_ones_own_is_read_as_oxfords(tmp_path: Path) -> None:
+def test_session_of_ones_own_is_read_as_oxfords_and_aligned(tmp_path: Path) -> None:
     printed = run_with_package("Write Oxford's files", tmp_path)
     assert printed.splitlines()[0] == "[]"
     for place in re.findall(r"(\d+\.\d+) m to the left", printed):
         assert abs(float(place) - 20.0) <= 0.25
+    pytest.importorskip("papermill")
+    shutil.rmtree(tmp_path / "sessions/my-town/velodyne_right")  # one lidar is enough, as the page says
+    (tmp_path / "sessions/my-town/velodyne_right.timestamps").unlink()
+    words = shlex.split(dict(code_blocks(OWN_RADAR, "Write Oxford's files"))["bash"])
+    command = [sys.executable, "-m", words[0], str(ROOT / words[1]), *words[2:]]
+    environment = {**os.environ, "PYTHONPATH": str(ROOT / "src"), "MPLBACKEND": "Agg"}
+    answer = subprocess.run(
+        command, cwd=tmp_path, env=environment, capture_output=True, encoding="utf-8", check=False
+    )
+    assert answer.returncode == 0, answer.stderr
+    summary = json.loads(
+        (tmp_path / "build/my-town/alignment/my-town/summary.json").read_text(encoding="utf-8")
+    )
+    assert summary["n_aligned"] == summary["n_scans"] == 4
 
 
 # ---- symbols and citations ------------------------------------------------------------------------------------
 
 
 def test_names_in_the_list_of_symbols_stand_in_the_code() -> None:
-    rows = re.findall(r"^\| \$.*$", (ROOT / "book" / "symbols.md").read_text(), re.MULTILINE)
+    rows = re.findall(r"^\| \$.*$", (ROOT / "book" / "symbols.md").read_text(encoding="utf-8"), re.MULTILINE)
     files = [*PACKAGE.glob("*.py"), *(ROOT / "notebooks").glob("0*.ipynb")]
-    words = {word for file in files for word in re.findall(r"\w+", file.read_text())}
+    words = {word for file in files for word in re.findall(r"\w+", file.read_text(encoding="utf-8"))}
     assert len(rows) > 40
     for row in rows:
         assert {name for name in re.findall(r"`\.?(\w+)(?:\(\))?`", row)} <= words, row
 
 
 def test_entries_for_citing_are_those_of_the_bibliography() -> None:
-    known = (ROOT / "book" / "references.bib").read_text()
-    entries = re.findall(r"^@.*?^}$", (ROOT / "book" / "cite.md").read_text(), re.MULTILINE | re.DOTALL)
+    known = (ROOT / "book" / "references.bib").read_text(encoding="utf-8")
+    entries = re.findall(
+        r"^@.*?^}$", (ROOT / "book" / "cite.md").read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL
+    )
     [book] = [entry for entry in entries if entry not in known]
     assert len(entries) == 6
-    version = re.search(r'__version__ = "(.*)"', (PACKAGE / "__init__.py").read_text())[1]
-    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text())
+    version = re.search(r'__version__ = "(.*)"', (PACKAGE / "__init__.py").read_text(encoding="utf-8"))[1]
+    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text(encoding="utf-8"))
     assert citation["version"] == version and f"Version {version}" in book
     assert citation["title"] in book and citation["authors"][0]["name"] in book
     paper = citation["preferred-citation"]

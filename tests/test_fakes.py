@@ -67,7 +67,7 @@ def test_folder_that_is_not_whole_is_not_taken_for_whole(
         list_fakes(folder)
     with pytest.raises(ValueError, match=f"{STAMPS[2]}.png: missing"):
         finish_fakes(folder, {}, STAMPS, {})
-    (folder / "fake.json").write_text('{"stamps": []}')
+    (folder / "fake.json").write_text('{"stamps": []}', encoding="utf-8")
     with pytest.raises(ValueError, match="fake.json: not a list of fakes"):
         list_fakes(folder)
 
@@ -105,7 +105,8 @@ def test_session_is_translated_and_left_alone_when_complete(
     assert list(fakes.translate_session(weights, session, folder)) == STAMPS
     stamps_us, points = list_fakes(folder)
     assert stamps_us == STAMPS and points["threshold"] == 100
-    monkeypatch.setattr(fakes, "_write_bytes", lambda path, data: pytest.fail(f"wrote {path}"))
+    for name in ("write_bytes", "write_text"):
+        monkeypatch.setattr(fakes, name, lambda path, data: pytest.fail(f"wrote {path}"))
     assert list(fakes.translate_session(weights, session, folder)) == STAMPS
 
 
@@ -150,7 +151,7 @@ def test_points_are_moved_to_mid_scan_once(session: Path, weights: Path, tmp_pat
     moved = list(fakes.read_points(folder, STAMPS, twists))
     np.testing.assert_array_equal(moved[1], compensate_points(recorded[1], twists[1]))
     assert np.abs(moved[1] - recorded[1]).max() > 0.1
-    about = json.loads((folder / "fake.json").read_text())
+    about = json.loads((folder / "fake.json").read_text(encoding="utf-8"))
     about["settings"]["pairs"]["motion"] = "corrected"  # the images are of mid-scan already
     (folder / "fake.json").write_text(json.dumps(about))
     np.testing.assert_array_equal(list(fakes.read_points(folder, STAMPS, twists))[1], recorded[1])

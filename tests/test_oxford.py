@@ -84,8 +84,8 @@ def session_root(tmp_path):
     oxford.save_timestamps(root / "velodyne_right.timestamps", sweeps)
     oxford.save_radar_odometry(root / "gt/radar_odometry.csv", make_odometry(scans[:5]))
     (root / "gps").mkdir()
-    (root / "gps/gps.csv").write_text(GPS_TEXT)
-    (root / "gps/ins.csv").write_text(INS_TEXT)
+    (root / "gps/gps.csv").write_text(GPS_TEXT, encoding="utf-8")
+    (root / "gps/ins.csv").write_text(INS_TEXT, encoding="utf-8")
     return root
 
 
@@ -446,7 +446,7 @@ def test_binary_writer_refuses_bad_points(tmp_path):
 
 def test_timestamps_keep_flags(tmp_path):
     path = tmp_path / "radar.timestamps"
-    path.write_text(f"{START} 1\n{START + 250_000} 0\n")
+    path.write_text(f"{START} 1\n{START + 250_000} 0\n", encoding="utf-8")
     stamps, valid = oxford.load_timestamps(path)
     assert_array_equal(stamps, [START, START + 250_000])
     assert_array_equal(valid, [True, False])
@@ -470,7 +470,7 @@ def test_timestamps_keep_flags(tmp_path):
 )
 def test_timestamp_faults_are_named(tmp_path, text, fault):
     path = tmp_path / "velodyne_left.timestamps"
-    path.write_text(text)
+    path.write_text(text, encoding="utf-8")
     with pytest.raises(OxfordError, match=fault) as error:
         oxford.load_timestamps(path)
     assert str(path) in str(error.value)
@@ -488,17 +488,17 @@ def test_gps_and_ins_round_trip_byte_for_byte(tmp_path):
         (INS_TEXT, oxford.load_ins, oxford.save_ins),
     ):
         path = tmp_path / "table.csv"
-        path.write_text(text)
+        path.write_text(text, encoding="utf-8")
         table = load(path)
         assert table.timestamp.dtype == np.int64
         save(path, table)
-        assert path.read_text() == text
+        assert path.read_text(encoding="utf-8") == text
     assert table.ins_status[0] == "INS_SOLUTION_GOOD" and table.yaw[0] == 0.047108
 
 
 def test_table_writer_refuses_what_the_reader_would(tmp_path):
     path = tmp_path / "gps.csv"
-    path.write_text(GPS_TEXT)
+    path.write_text(GPS_TEXT, encoding="utf-8")
     table = oxford.load_gps(path)
     for fault, bad in {
         "num_satellites: a value does not fit into int64": table.assign(num_satellites=[7, 7.5]),
@@ -508,7 +508,7 @@ def test_table_writer_refuses_what_the_reader_would(tmp_path):
     }.items():
         with pytest.raises(OxfordError, match=fault):
             oxford.save_gps(path, bad)
-    assert path.read_text() == GPS_TEXT  # what was there is still there
+    assert path.read_text(encoding="utf-8") == GPS_TEXT  # what was there is still there
 
 
 @pytest.mark.parametrize(
@@ -526,12 +526,16 @@ def test_table_writer_refuses_what_the_reader_would(tmp_path):
         (lambda t: t[:-2], "the last line is cut off"),
         (lambda t: t[:-30] + "\n", "line 3 has 9 fields, not 12"),
         (lambda t: t.splitlines()[0] + "\n", "no rows"),
+        (lambda t: t.replace("\n", ",a\n"), "unknown or doubled columns: a$"),
+        (lambda t: t.replace("down", "up"), "missing columns: down; unknown or doubled columns: up$"),
+        (lambda t: t.replace("\n", ",latitude\n"), "unknown or doubled columns: latitude$"),
+        (lambda t: "\ufeff", "file is empty"),
         (lambda t: t.replace("latitude,longitude", "longitude,latitude"), "wrong columns"),
     ],
 )
 def test_table_faults_are_named(tmp_path, change, fault):
     path = tmp_path / "gps.csv"
-    path.write_text(change(GPS_TEXT))
+    path.write_text(change(GPS_TEXT), encoding="utf-8")
     with pytest.raises(OxfordError, match=fault) as error:
         oxford.load_gps(path)
     assert str(path) in str(error.value)
@@ -544,12 +548,12 @@ def test_extrinsics(tmp_path):
         "velodyne_left": "-0.60072 -0.34077 -0.26837 -0.0053948 -0.041998 -3.1337\n",
         "velodyne_right": "-0.61153 0.55676 -0.27023 0.0027052 -0.041999 -3.1357\n",
     }.items():
-        path.write_text(text)
+        path.write_text(text, encoding="utf-8")
         assert_allclose(oxford.load_extrinsics(path), oxford.EXTRINSICS[name], atol=1e-15)
         oxford.save_extrinsics(path, oxford.EXTRINSICS[name])
-        assert path.read_text() == text
+        assert path.read_text(encoding="utf-8") == text
     for text in ("1 2 3\n", "1 2 3 4 5 nan\n", "1 2 3 4 5 x\n"):
-        path.write_text(text)
+        path.write_text(text, encoding="utf-8")
         with pytest.raises(OxfordError, match=r"radar\.txt: expected six numbers"):
             oxford.load_extrinsics(path)
 
@@ -578,7 +582,7 @@ HAND_ODOMETRY = (
 
 def test_odometry_is_turned_into_our_axes_and_composed(tmp_path):
     path = tmp_path / "radar_odometry.csv"
-    path.write_text(HAND_ODOMETRY)
+    path.write_text(HAND_ODOMETRY, encoding="utf-8")
     odometry = oxford.load_radar_odometry(path)
     assert_allclose(odometry.steps, [[2, -1, -1.570796], [3, 0, 0]])  # 1 m right, a quarter turn to the right
     radar_stamps, mid_stamps, poses = oxford.compose_odometry(odometry)
@@ -588,12 +592,12 @@ def test_odometry_is_turned_into_our_axes_and_composed(tmp_path):
     _, _, moved = oxford.compose_odometry(odometry, start=(10, 0, np.pi / 2))
     assert_allclose(moved, [[10, 0, np.pi / 2], [11, 2, 0], [14, 2, 0]], atol=1e-5)
     oxford.save_radar_odometry(tmp_path / "again.csv", odometry)
-    assert (tmp_path / "again.csv").read_text() == HAND_ODOMETRY  # minus zeros included
+    assert (tmp_path / "again.csv").read_text(encoding="utf-8") == HAND_ODOMETRY  # minus zeros included
 
 
 def test_poses_at_interpolates_and_names_the_file_outside(tmp_path):
     path = tmp_path / "radar_odometry.csv"
-    path.write_text(HAND_ODOMETRY)
+    path.write_text(HAND_ODOMETRY, encoding="utf-8")
     odometry = oxford.load_radar_odometry(path)
     assert_allclose(oxford.poses_at(odometry, [1_250_000]), [[1, -0.5, -np.pi / 4]], atol=1e-5)
     for stamp in (1_124_999, 1_625_001):
@@ -615,7 +619,7 @@ def test_poses_at_interpolates_and_names_the_file_outside(tmp_path):
 )
 def test_odometry_faults_are_named(tmp_path, change, fault):
     path = tmp_path / "radar_odometry.csv"
-    path.write_text(change(HAND_ODOMETRY))
+    path.write_text(change(HAND_ODOMETRY), encoding="utf-8")
     with pytest.raises(OxfordError, match=fault) as error:
         oxford.load_radar_odometry(path)
     assert str(path) in str(error.value)
@@ -633,7 +637,7 @@ def test_odometry_writer_refuses_nan_and_odd_lengths(tmp_path):
 def test_a_gap_in_the_odometry_is_not_composed_over(tmp_path):
     lines = HAND_ODOMETRY.splitlines(keepends=True)
     path = tmp_path / "radar_odometry.csv"
-    path.write_text(lines[0] + lines[1] + "1875000,1625000,1,0,0,0,0,0,1750000,1500000\n")
+    path.write_text(lines[0] + lines[1] + "1875000,1625000,1,0,0,0,0,0,1750000,1500000\n", encoding="utf-8")
     odometry = oxford.load_radar_odometry(path)
     with pytest.raises(
         OxfordError, match=rf"{path.name}: gap before line 3: from scan 1250000 to scan 1500000"
@@ -672,7 +676,7 @@ def test_incomplete_sessions_are_refused(session_root):
     shutil.copytree(session_root, virtual)
     with pytest.raises(OxfordError, match="virtual-town-train: incomplete session, session.json missing"):
         oxford.open_session(virtual)
-    (virtual / "session.json").write_text("{}")
+    (virtual / "session.json").write_text("{}", encoding="utf-8")
     assert oxford.open_session(virtual).name == "virtual-town-train"
     (session_root / "radar.timestamps").unlink()
     with pytest.raises(OxfordError, match="radar.timestamps missing; sessions beside it: virtual-town-train"):
@@ -691,6 +695,35 @@ def test_a_missing_lidar_is_none_and_named_when_asked_for(session_root):
     assert any("velodyne_right" in fault and "missing" in fault for fault in oxford.check_session(session))
 
 
+def test_a_file_in_place_of_a_folder_is_named(session_root):
+    shutil.rmtree(session_root / "velodyne_left")
+    (session_root / "velodyne_left").touch()
+    (session_root / "velodyne_right.timestamps").unlink()
+    (session_root / "velodyne_right.timestamps").mkdir()
+    shutil.rmtree(session_root / "gt")
+    (session_root / "gt").touch()
+    session = oxford.open_session(session_root)
+    assert session.right_stamps_us is None
+    assert oxford.check_session(session) == [
+        f"{session_root}/velodyne_left: not a folder",
+        f"{session_root}/velodyne_right.timestamps: not a file",
+        f"{session_root}/gt/radar_odometry.csv: file is missing",
+    ]
+    shutil.rmtree(session_root / "radar")
+    (session_root / "radar").touch()
+    with pytest.raises(OxfordError, match="incomplete session, radar missing"):
+        oxford.open_session(session_root)
+
+
+def test_a_broken_link_is_an_empty_file(session_root):
+    path = session_root / "radar" / f"{START}.png"
+    path.unlink()
+    path.symlink_to("nowhere.png")
+    assert f"{session_root}/radar: 1 empty files, the first: {START}.png" in oxford.check_session(
+        oxford.open_session(session_root)
+    )
+
+
 def test_a_missing_sweep_is_named(session_root):
     session = oxford.open_session(session_root)
     with pytest.raises(OxfordError, match=f"{START + 1}.png: file is missing, and so is {START + 1}.bin"):
@@ -702,7 +735,7 @@ def test_check_session_names_every_fault(session_root):
     (session_root / "radar" / f"{scans[1]}.png").unlink()
     shutil.copy(session_root / "radar" / f"{scans[0]}.png", session_root / "radar" / f"{scans[0] + 7}.png")
     (session_root / "radar" / f"{scans[2]}.png").write_bytes(b"")
-    (session_root / "radar" / "notes.txt").write_text("x")
+    (session_root / "radar" / "notes.txt").write_text("x", encoding="utf-8")
     oxford.save_timestamps(session_root / "radar.timestamps", scans, scans != scans[3])
     keep = np.r_[0:4, 8:20]
     oxford.save_timestamps(session_root / "velodyne_left.timestamps", START + keep * 50_000)
@@ -735,7 +768,7 @@ def test_check_session_reports_broken_odometry_and_late_truth(session_root):
     assert oxford.check_session(session) == [f"{path}: 2 scans before the first pose, the first: {scans[0]}"]
     oxford.save_radar_odometry(path, make_odometry(scans[[0, 1, 3, 4]]))
     assert "1 scans without a pose within the truth's span" in oxford.check_session(session)[0]
-    path.write_text(path.read_text()[:-20])
+    path.write_text(path.read_text(encoding="utf-8")[:-20], encoding="utf-8")
     assert oxford.check_session(session)[0].startswith(f"{path}: the last line is cut off")
     path.unlink()
     assert oxford.check_session(session) == [f"{path}: file is missing"]

@@ -1,6 +1,7 @@
 """Networks against the public ones, losses and a step by hand, `generate` at both ends, files of weights."""
 
 import copy
+import json
 import math
 from pathlib import Path
 
@@ -360,6 +361,44 @@ def test_weights_of_others_are_refused(tmp_path: Path) -> None:
         load_weights(path)
     save_tensors(path, {"w": torch.zeros(2)}, {"architecture": "u-net"})
     with pytest.raises(Pix2PixError, match="other.safetensors: architecture 'u-net'"):
+        load_weights(path)
+
+
+def contiguous(network: nn.Module) -> dict[str, torch.Tensor]:
+    return {name: tensor.contiguous() for name, tensor in network.state_dict().items()}
+
+
+HEADER = {"architecture": ARCHITECTURES["resnet"], "filters": 2, "blocks": 1, "image_size": None}
+
+
+@pytest.mark.parametrize(
+    ("header", "fault"),
+    [
+        ("{", "header is not whole JSON"),
+        ("[1]", r"header is \[1\], not a JSON object"),
+        (json.dumps({**HEADER, "filters": None}), "header: filters is None, expected a whole number"),
+        (json.dumps({**HEADER, "blocks": "1"}), "header: blocks is '1', expected a whole number"),
+        (json.dumps({**HEADER, "headings": 1.5}), "header: headings is 1.5, expected a whole number"),
+        (json.dumps({**HEADER, "image_size": 512}), "header: image_size is 512, expected two numbers"),
+    ],
+)
+def test_broken_headers_are_named(tmp_path: Path, header: str, fault: str) -> None:
+    path = tmp_path / "g.safetensors"
+    save_file(contiguous(tiny_generator()), path, {"rol": header})
+    with pytest.raises(Pix2PixError, match=f"g.safetensors: {fault}"):
+        load_weights(path)
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf])
+def test_weights_that_are_not_finite_are_neither_read_nor_written(tmp_path: Path, value: float) -> None:
+    path, generator = tmp_path / "g.safetensors", tiny_generator()
+    name, weight = list(generator.named_parameters())[-1]
+    nn.init.constant_(weight, value)
+    fault = f"g.safetensors: tensor '{name}' holds a value that is not finite"
+    with pytest.raises(Pix2PixError, match=fault):
+        save_weights(path, generator)
+    save_file(contiguous(generator), path, {"rol": json.dumps(HEADER)})
+    with pytest.raises(Pix2PixError, match=fault):
         load_weights(path)
 
 

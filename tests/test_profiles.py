@@ -19,16 +19,16 @@ import rol
 ROOT = Path(__file__).resolve().parents[1]
 PROFILES = ROOT / "workflow" / "profiles"
 NAMES = sorted(path.parent.name for path in PROFILES.glob("*/config.yaml"))
-RULES = set(re.findall(r"^rule (\w+):", (ROOT / "Snakefile").read_text(), flags=re.MULTILINE))
+RULES = set(re.findall(r"^rule (\w+):", (ROOT / "Snakefile").read_text(encoding="utf-8"), flags=re.MULTILINE))
 HOOKS = {
     hook["id"]: hook
-    for repo in yaml.safe_load((ROOT / ".pre-commit-config.yaml").read_text())["repos"]
+    for repo in yaml.safe_load((ROOT / ".pre-commit-config.yaml").read_text(encoding="utf-8"))["repos"]
     for hook in repo["hooks"]
 }
 
 
 def load_profile(name: str) -> dict:
-    return yaml.safe_load((PROFILES / name / "config.yaml").read_text())
+    return yaml.safe_load((PROFILES / name / "config.yaml").read_text(encoding="utf-8"))
 
 
 def requests(profile: dict) -> dict[str, dict[str, int]]:
@@ -67,7 +67,9 @@ def test_profiles_ask_for_the_same() -> None:
 def test_plugin_of_the_executor_is_pinned(name: str) -> None:
     executor = load_profile(name)["executor"]
     pins = [
-        line for line in (PROFILES / name / "requirements.txt").read_text().splitlines() if line[:1].isalpha()
+        line
+        for line in (PROFILES / name / "requirements.txt").read_text(encoding="utf-8").splitlines()
+        if line[:1].isalpha()
     ]
     assert pins and all(re.fullmatch(r"[\w-]+==\d+\.\d+\.\d+", pin) for pin in pins)
     assert pins[0].startswith(f"snakemake-executor-plugin-{executor}==")
@@ -84,7 +86,7 @@ def test_profile_plans_all_jobs(name: str, tmp_path: Path) -> None:
     executor = profile.pop("executor")
     own = {key: value for key, value in profile.items() if not key.startswith(f"{executor}-")}
     (tmp_path / "profile").mkdir()
-    (tmp_path / "profile" / "config.yaml").write_text(yaml.safe_dump(own))
+    (tmp_path / "profile" / "config.yaml").write_text(yaml.safe_dump(own), encoding="utf-8")
     words = [
         "--snakefile",
         str(ROOT / "Snakefile"),
@@ -109,9 +111,11 @@ def test_profile_plans_all_jobs(name: str, tmp_path: Path) -> None:
 
 
 def test_page_shows_the_profiles_as_they_are() -> None:
-    page = (ROOT / "book/cluster.md").read_text()
+    page = (ROOT / "book/cluster.md").read_text(encoding="utf-8")
     shown = re.findall(r"```yaml\n(executor:.*?)```", page, flags=re.DOTALL)
-    texts = [(PROFILES / name / "config.yaml").read_text() for name in ("slurm", "kubernetes")]
+    texts = [
+        (PROFILES / name / "config.yaml").read_text(encoding="utf-8") for name in ("slurm", "kubernetes")
+    ]
     assert len(shown) == 2
     assert all(block in text for block, text in zip(shown, texts, strict=True))
 
@@ -120,7 +124,7 @@ def test_script_that_tries_slurm_is_a_script() -> None:
     script = ROOT / "workflow/try_slurm.sh"
     assert os.access(script, os.X_OK)
     subprocess.run(["bash", "-n", script], check=True)
-    assert "--profile workflow/profiles/slurm" in script.read_text()
+    assert "--profile workflow/profiles/slurm" in script.read_text(encoding="utf-8")
 
 
 # ---- jobs of Kubernetes ---------------------------------------------------------------------------------------
@@ -186,7 +190,7 @@ def test_state_of_a_job_is_told_in_the_words_of_snakemake(
     answer: str, status: int, told: str, tmp_path: Path
 ) -> None:
     kubectl = tmp_path / "kubectl"
-    kubectl.write_text(f"#!/bin/sh\nprintf '%s' '{answer}'\nexit {status}\n")
+    kubectl.write_text(f"#!/bin/sh\nprintf '%s' '{answer}'\nexit {status}\n", encoding="utf-8")
     kubectl.chmod(0o755)
     environment = os.environ | {"PATH": f"{tmp_path}:{os.environ['PATH']}"}
     script = ROOT / load_profile("kubernetes")["cluster-generic-status-cmd"]
@@ -206,7 +210,7 @@ def run_hook(name: str, *files: Path) -> subprocess.CompletedProcess:
 
 
 def test_hooks_need_no_network() -> None:
-    repos = yaml.safe_load((ROOT / ".pre-commit-config.yaml").read_text())["repos"]
+    repos = yaml.safe_load((ROOT / ".pre-commit-config.yaml").read_text(encoding="utf-8"))["repos"]
     assert [repo["repo"] for repo in repos] == ["local"]
     assert {hook["language"] for hook in HOOKS.values()} == {"system"}
     assert {"jupyter", "python"} <= set(HOOKS["ruff-check"]["types_or"]) & set(
@@ -216,13 +220,13 @@ def test_hooks_need_no_network() -> None:
 
 def test_ruff_hooks_find_faults_in_code_and_notebooks(tmp_path: Path) -> None:
     bad, good = tmp_path / "bad.py", tmp_path / "good.py"
-    bad.write_text("import os\nx = 'a'\n")
-    good.write_text('x = "a"\n')
+    bad.write_text("import os\nx = 'a'\n", encoding="utf-8")
+    good.write_text('x = "a"\n', encoding="utf-8")
     for hook in ("ruff-check", "ruff-format"):
         assert run_hook(hook, good).returncode == 0
     assert "F401" in run_hook("ruff-check", bad).stdout
     run_hook("ruff-format", bad)
-    assert '"a"' in bad.read_text()
+    assert '"a"' in bad.read_text(encoding="utf-8")
     for hook in ("ruff-check", "ruff-format"):
         answer = run_hook(hook, *sorted((ROOT / "notebooks").glob("*.ipynb")))
         assert answer.returncode == 0, answer.stdout
@@ -248,7 +252,9 @@ def test_files_of_the_project_are_not_large() -> None:
 
 
 def test_changelog_begins_with_this_version() -> None:
-    headings = re.findall(r"^## \[(\S+)\]", (ROOT / "CHANGELOG.md").read_text(), flags=re.MULTILINE)
+    headings = re.findall(
+        r"^## \[(\S+)\]", (ROOT / "CHANGELOG.md").read_text(encoding="utf-8"), flags=re.MULTILINE
+    )
     assert next(heading for heading in headings if heading != "Unreleased") == rol.__version__
 
 
@@ -256,7 +262,7 @@ def test_binder_makes_a_session_of_the_demo() -> None:
     script = ROOT / "postBuild"
     assert os.access(script, os.X_OK)
     config, session, out = re.search(
-        r"rol\.virtual (\S+) --session (\S+) --out (\S+)", script.read_text()
+        r"rol\.virtual (\S+) --session (\S+) --out (\S+)", script.read_text(encoding="utf-8")
     ).groups()
     demo = chapters.load_config(ROOT / config)
     assert demo["profile"] == "demo" and session == demo["sessions"][0] and out == demo["sessions_root"]

@@ -60,12 +60,12 @@ def tracked_text_files() -> list[Path]:
 def test_lock_pins_every_version_and_covers_the_package() -> None:
     pins = [
         Requirement(line)
-        for line in (ROOT / "requirements.lock").read_text().splitlines()
+        for line in (ROOT / "requirements.lock").read_text(encoding="utf-8").splitlines()
         if line[:1].isalnum()
     ]
     assert all(len(pin.specifier) == 1 and str(pin.specifier).startswith("==") for pin in pins)
     versions = {canonical(pin.name): str(pin.specifier)[2:] for pin in pins}
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     wanted = project["dependencies"] + [
         r for extra in project["optional-dependencies"].values() for r in extra
     ]
@@ -76,14 +76,14 @@ def test_lock_pins_every_version_and_covers_the_package() -> None:
 
 
 def test_environment_file_reads_the_lock() -> None:
-    pip = yaml.safe_load((ROOT / "environment.yml").read_text())["dependencies"][-1]["pip"]
+    pip = yaml.safe_load((ROOT / "environment.yml").read_text(encoding="utf-8"))["dependencies"][-1]["pip"]
     assert "-r requirements.lock" in pip
 
 
 def test_no_file_names_a_path_of_a_machine() -> None:
     home = re.compile(r"(?<![\w.])/(?:home|root|Users)/\w")
     for file in tracked_text_files():
-        text = file.read_text()
+        text = file.read_text(encoding="utf-8")
         assert str(ROOT) not in text, f"{file} names the folder it lay in"
         assert not home.search(text), f"{file}: {home.search(text)[0]}"
 
@@ -209,7 +209,7 @@ def test_imports_are_followed_through_the_package(tmp_path: Path) -> None:
         "virtual/world.py": "import numpy",
     }
     for name, text in files.items():
-        (tmp_path / name).write_text(text)
+        (tmp_path / name).write_text(text, encoding="utf-8")
 
     def names(*sources: str) -> set[str]:
         return {file.relative_to(tmp_path).as_posix() for file in chapters.module_files(sources, tmp_path)}
@@ -372,7 +372,7 @@ def test_unknown_knob_ends_before_anything_runs(workplace: Path) -> None:
     config = chapters.load_config(ROOT / "config/smoke.yaml") | {
         "notebooks": {"08_results": {"no_such_knob": 1}}
     }
-    (workplace / "mine.yaml").write_text(yaml.safe_dump(config))
+    (workplace / "mine.yaml").write_text(yaml.safe_dump(config), encoding="utf-8")
     answer = snakemake(workplace, "-n", "--configfile", "mine.yaml")
     assert answer.returncode != 0
     assert "has no parameter no_such_knob" in answer.stdout + answer.stderr

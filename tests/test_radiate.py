@@ -15,14 +15,18 @@ def make_sample(root: Path) -> Path:
     for name in ("Navtech_Polar", "velo_lidar"):
         (folder / name).mkdir(parents=True)
     calibration.parent.mkdir(parents=True)
-    calibration.write_text("lidar_calib:\n    T: [0.5, -0.25, 0.125]\n    R: [0, 0, 0]\n")
-    (folder / "Navtech_Polar.txt").write_text("Frame: 000001 Time: 100.2\n")
-    (folder / "velo_lidar.txt").write_text("Frame: 000007 Time: 100.1\nFrame: 000008 Time: 100.25\n")
+    calibration.write_text("lidar_calib:\n    T: [0.5, -0.25, 0.125]\n    R: [0, 0, 0]\n", encoding="utf-8")
+    (folder / "Navtech_Polar.txt").write_text("Frame: 000001 Time: 100.2\n", encoding="utf-8")
+    (folder / "velo_lidar.txt").write_text(
+        "Frame: 000007 Time: 100.1\nFrame: 000008 Time: 100.25\n", encoding="utf-8"
+    )
     image = np.zeros((radiate.N_BINS, radiate.N_AZIMUTHS), dtype=np.uint8)
     image[120, 100] = 200
     cv2.imwrite(str(folder / "Navtech_Polar" / "000001.png"), image)
     for number in (7, 8):
-        (folder / "velo_lidar" / f"{number:06d}.csv").write_text(f"1,{number},3,4,5\n2,2,2,2,2\n")
+        (folder / "velo_lidar" / f"{number:06d}.csv").write_text(
+            f"1,{number},3,4,5\n2,2,2,2,2\n", encoding="utf-8"
+        )
     return folder
 
 

@@ -48,13 +48,13 @@ def test_real_scans_come_with_pose_and_velocity(real_root: Path, tmp_path: Path)
     for scan in (*scans[:2], scans[-1]):
         (folder / scan.path.name).write_bytes(scan.path.read_bytes())
         lines.append(",".join(map(str, (scan.stamp_us, *scan.pose))))
-    (tmp_path / rall.SCAN_POSES_PATH).write_text("\n".join(lines))
+    (tmp_path / rall.SCAN_POSES_PATH).write_text("\n".join(lines), encoding="utf-8")
     alone = rall.load_scans(tmp_path)
     assert alone[0].twist == pytest.approx(scans[0].twist, abs=0.3) and alone[2].twist is None
 
 
 def test_real_scans_that_are_missing_are_told(tmp_path: Path) -> None:
-    (tmp_path / rall.SCAN_POSES_PATH).write_text("timestamp_us,x_m,y_m,yaw_rad\n1,0,0,0\n")
+    (tmp_path / rall.SCAN_POSES_PATH).write_text("timestamp_us,x_m,y_m,yaw_rad\n1,0,0,0\n", encoding="utf-8")
     with pytest.raises(rall.RallError, match="holds none of the 1 scans"):
         rall.load_scans(tmp_path)
 
@@ -115,7 +115,7 @@ def test_map_cells_lie_where_the_readme_says(tmp_path: Path) -> None:
 def test_faulty_poses_are_named(tmp_path: Path, content: str | None, fault: str) -> None:
     path = tmp_path / "pose_xy_03.txt"
     if content is not None:
-        path.write_text(content)
+        path.write_text(content, encoding="utf-8")
     with pytest.raises(rall.RallError, match=f"pose_xy_03.txt: .*{fault}"):
         rall.load_poses(path)
 
@@ -140,6 +140,6 @@ def test_faulty_maps_and_scan_poses_are_named(tmp_path: Path) -> None:
     with pytest.raises(rall.RallError, match=r"poses.csv: missing"):
         rall.load_scan_poses(table)
     for row, fault in (("12,1.0,2.0,nan", "all finite"), ("noon,1,2,3", "line 2")):
-        table.write_text(f"timestamp_us,x_m,y_m,yaw_rad\n{row}\n")
+        table.write_text(f"timestamp_us,x_m,y_m,yaw_rad\n{row}\n", encoding="utf-8")
         with pytest.raises(rall.RallError, match=fault):
             rall.load_scan_poses(table)

@@ -19,8 +19,23 @@ KNOWN = {"ROL_REPOSITORY_URL": "https://git.example.org/people/radar.git"}
 
 @pytest.fixture
 def book(tmp_path: Path) -> Path:
-    (tmp_path / "_config.yml").write_text((ROOT / "book/_config.yml").read_text())
+    (tmp_path / "_config.yml").write_text(
+        (ROOT / "book/_config.yml").read_text(encoding="utf-8"), encoding="utf-8"
+    )
     return tmp_path
+
+
+def test_only_a_staged_book_is_removed(tmp_path: Path) -> None:
+    (tmp_path / "_build" / "html").mkdir(parents=True)  # the workflow makes the folder of its output
+    stage_book.clear(tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == ["made.md"]
+    (tmp_path / "intro.md").touch()
+    stage_book.clear(tmp_path)
+    assert not (tmp_path / "intro.md").exists()
+    (tmp_path / "made.md").rename(tmp_path / "thesis.md")
+    with pytest.raises(ChapterError, match="holds files but no made.md"):
+        stage_book.clear(tmp_path)
+    assert (tmp_path / "thesis.md").is_file()
 
 
 @pytest.fixture(scope="module")
@@ -38,16 +53,16 @@ def quiet_pages() -> ModuleType:
 
 @pytest.mark.parametrize("environment", [{}, {"ROL_REPOSITORY_URL": ""}, {"ROL_REPOSITORY_BRANCH": "next"}])
 def test_without_an_address_the_settings_stay_as_they_are(book: Path, environment: dict) -> None:
-    before = (book / "_config.yml").read_text()
+    before = (book / "_config.yml").read_text(encoding="utf-8")
     stage_book.stage_settings(book, environment)
-    assert (book / "_config.yml").read_text() == before
+    assert (book / "_config.yml").read_text(encoding="utf-8") == before
     assert not {"repository", "launch_buttons"} & set(yaml.safe_load(before))
 
 
 def test_with_an_address_the_book_gets_a_button_for_binder(book: Path) -> None:
-    before = yaml.safe_load((book / "_config.yml").read_text())
+    before = yaml.safe_load((book / "_config.yml").read_text(encoding="utf-8"))
     stage_book.stage_settings(book, KNOWN)
-    after = yaml.safe_load((book / "_config.yml").read_text())
+    after = yaml.safe_load((book / "_config.yml").read_text(encoding="utf-8"))
     assert after == before | {
         "repository": {"url": "https://git.example.org/people/radar", "branch": "main"},
         "launch_buttons": {"notebook_interface": "jupyterlab", "binderhub_url": "https://mybinder.org"},
@@ -77,11 +92,13 @@ def test_address_that_no_browser_opens_is_refused(name: str, address: str) -> No
 def test_staged_settings_pass_the_check_of_the_book(book: Path) -> None:
     config = pytest.importorskip("jupyter_book.config")
     stage_book.stage_settings(book, KNOWN)
-    config.validate_yaml(yaml.safe_load((book / "_config.yml").read_text()), raise_on_errors=True)
+    config.validate_yaml(
+        yaml.safe_load((book / "_config.yml").read_text(encoding="utf-8")), raise_on_errors=True
+    )
 
 
 def test_binder_finds_what_the_button_needs() -> None:
-    environment = yaml.safe_load((ROOT / "environment.yml").read_text())
+    environment = yaml.safe_load((ROOT / "environment.yml").read_text(encoding="utf-8"))
     assert any(str(part).startswith("python=3.1") for part in environment["dependencies"])
     assert {"-r requirements.lock", "-e ."} <= set(environment["dependencies"][-1]["pip"])
     # With a folder of this name Binder would read that, and not the file.
@@ -137,23 +154,24 @@ def test_finished_pages_are_cleaned(quiet_pages: ModuleType, tmp_path: Path) -> 
     (tmp_path / "a.html").write_text(
         '<head>\n<link rel="preload" as="font" crossorigin href="f.woff2" />\n<link rel="stylesheet" href="a.css">\n'
         '<script src="_static/vendor/fontawesome/6.5.2/js/all.min.js?digest=1"></script>\n<script src="a.js"></script>'
-        '</head><p><span class="pasted-text">`rol` is better than `paper`</span> `as it stands`</p>'
+        '</head><p><span class="pasted-text">`rol` is better than `paper`</span> `as it stands`</p>',
+        encoding="utf-8",
     )
     twice = '<input id="search-input"><input id="search-input">'
-    (tmp_path / "search.html").write_text(twice)
+    (tmp_path / "search.html").write_text(twice, encoding="utf-8")
     app = SimpleNamespace(outdir=tmp_path, builder=SimpleNamespace(format="html"))
     quiet_pages.clean_pages(app, None)
     code = '<code class="docutils literal notranslate">{}</code>'
-    assert (tmp_path / "a.html").read_text() == (
+    assert (tmp_path / "a.html").read_text(encoding="utf-8") == (
         '<head>\n<link rel="stylesheet" href="a.css">\n<script src="a.js"></script></head><p><span class="pasted-text">'
         f"{code.format('rol')} is better than {code.format('paper')}</span> `as it stands`</p>"
     )
-    assert (tmp_path / "search.html").read_text() == (
+    assert (tmp_path / "search.html").read_text(encoding="utf-8") == (
         '<input id="search-input"><input id="search-input-of-page">'
     )
-    (tmp_path / "search.html").write_text(twice)
+    (tmp_path / "search.html").write_text(twice, encoding="utf-8")
     quiet_pages.clean_pages(app, RuntimeError("the build has failed"))
-    assert (tmp_path / "search.html").read_text() == twice
+    assert (tmp_path / "search.html").read_text(encoding="utf-8") == twice
 
 
 # ---- links and the first picture ------------------------------------------------------------------------------
@@ -191,13 +209,13 @@ def test_first_picture_is_real_where_it_can_be(
 ) -> None:
     (book / "images").mkdir()
     for name in ("real.md", "virtual.md"):
-        (book / "images" / name).write_text(name)
+        (book / "images" / name).write_text(name, encoding="utf-8")
     pngs = {"10_real_radar": real, "07_localization": b"virtual"}
     runs = {c: write_run(book / f"{c}.ipynb", f, pngs[c]) for c, f, _ in stage_book.RESULT_FIGURES}
     monkeypatch.setattr(stage_book, "book_pages", lambda config: runs)
     stage_book.stage_result_figure({"out_dir": ""}, book)
     assert (book / "images" / "result.png").read_bytes() == (real or b"virtual")
-    assert (book / "picture.md").read_text() == words
+    assert (book / "picture.md").read_text(encoding="utf-8") == words
 
 
 def test_book_without_a_first_picture_is_refused(book: Path, monkeypatch: pytest.MonkeyPatch) -> None:

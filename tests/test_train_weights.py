@@ -48,7 +48,7 @@ def recipe(tmp_path_factory: pytest.TempPathFactory, monkeypatch_module: pytest.
     folder = tmp_path_factory.mktemp("weights")
     places = {"out_dir": str(folder / "out"), "sessions_root": str(folder / "sessions")}
     path = folder / "recipe.yaml"
-    path.write_text(yaml.safe_dump({**yaml.safe_load(RECIPE), **places}))
+    path.write_text(yaml.safe_dump({**yaml.safe_load(RECIPE), **places}), encoding="utf-8")
     return path
 
 
@@ -57,7 +57,7 @@ def test_one_command_makes_sessions_weights_and_card(
 ) -> None:
     monkeypatch.setattr(train_weights, "WEIGHTS", tmp_path)
     assert train_weights.main([str(recipe), "tiny", "--threads", "1"]) == 0
-    card = json.loads((tmp_path / "tiny.json").read_text())
+    card = json.loads((tmp_path / "tiny.json").read_text(encoding="utf-8"))
     assert (
         card["recipe"]["network"]["filters"] == 4
         and card["recipe"]["seed"] == 1
@@ -78,13 +78,15 @@ def test_one_command_makes_sessions_weights_and_card(
     assert (
         train_weights.main([str(recipe), "tiny", "--threads", "1"]) == 0
     )  # all is there: nothing is trained again
-    again = json.loads((tmp_path / "tiny.json").read_text())
+    again = json.loads((tmp_path / "tiny.json").read_text(encoding="utf-8"))
     assert again["history"] == card["history"] and again["judged"] == card["judged"]
     assert "tiny: step" not in capsys.readouterr().out
     assert train_weights.main([str(recipe), "tiny", "--threads", "1", "--judge"]) == 0
     assert "largest difference of a share: 0.0" in capsys.readouterr().out
     judged.fake_to_real_within_1m += 0.1
-    (tmp_path / "tiny.json").write_text(json.dumps({**card, "judged": train_weights.as_lists(judged)}))
+    (tmp_path / "tiny.json").write_text(
+        json.dumps({**card, "judged": train_weights.as_lists(judged)}), encoding="utf-8"
+    )
     assert train_weights.main([str(recipe), "tiny", "--threads", "1", "--judge"]) == 1
 
 
@@ -138,7 +140,7 @@ def test_faulty_recipes_are_told(recipe: Path, arguments: list[str], fault: str)
 
 
 def test_recipes_that_lack_a_part_are_told(tmp_path: Path) -> None:
-    (tmp_path / "r.yaml").write_text("seed: 1\n")
+    (tmp_path / "r.yaml").write_text("seed: 1\n", encoding="utf-8")
     with pytest.raises(ValueError, match="r.yaml: the key 'ablations' is missing"):
         train_weights.load_recipe(tmp_path / "r.yaml")
     with pytest.raises(ValueError, match="no world has a session 'virtual-y'; there are: virtual-x"):

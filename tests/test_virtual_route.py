@@ -73,7 +73,7 @@ def recipe(folder: Path, root: Path, **session: object) -> Path:
     }
     section = {"world": "route", "real_root": str(root), "seed": 5, "sessions": {NAME: own}}
     path = folder / "route.yaml"
-    path.write_text(yaml.safe_dump({"virtual": section}))
+    path.write_text(yaml.safe_dump({"virtual": section}), encoding="utf-8")
     return path
 
 

@@ -34,7 +34,7 @@ virtual:
 @pytest.fixture(scope="module")
 def recipe(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("config") / "tiny.yaml"
-    path.write_text(RECIPE)
+    path.write_text(RECIPE, encoding="utf-8")
     return path
 
 
@@ -101,7 +101,7 @@ def test_bad_settings_are_named(section: object, message: str) -> None:
 def test_bad_files_and_names_are_named(tmp_path: Path, recipe: Path) -> None:
     with pytest.raises(SettingsError, match="nowhere.yaml: cannot be read"):
         load_settings(tmp_path / "nowhere.yaml")
-    (tmp_path / "other.yaml").write_text("profile: demo\n")
+    (tmp_path / "other.yaml").write_text("profile: demo\n", encoding="utf-8")
     with pytest.raises(SettingsError, match="other.yaml: no section 'virtual'"):
         load_settings(tmp_path / "other.yaml")
     with pytest.raises(SettingsError, match=f"no session 'virtual-b' in the settings; there are: {NAME}"):
@@ -110,7 +110,9 @@ def test_bad_files_and_names_are_named(tmp_path: Path, recipe: Path) -> None:
 
 
 def test_unknown_sensor_settings_are_named(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
-    (tmp_path / "tiny.yaml").write_text(RECIPE.replace("  seed: 3\n", "  seed: 3\n  lidar: {noise: 1}\n"))
+    (tmp_path / "tiny.yaml").write_text(
+        RECIPE.replace("  seed: 3\n", "  seed: 3\n  lidar: {noise: 1}\n"), encoding="utf-8"
+    )
     status = main([str(tmp_path / "tiny.yaml"), "--session", NAME, "--out", str(tmp_path)])
     assert status == 1
     assert "lidar: unknown key 'noise'; known are: range_noise_m" in capsys.readouterr().err
@@ -246,12 +248,12 @@ def test_gps_and_ins_lie_in_the_town(folder: Path) -> None:
 
 
 def test_description_says_how_it_was_made(folder: Path, recipe: Path) -> None:
-    said = json.loads((folder / "session.json").read_text())
+    said = json.loads((folder / "session.json").read_text(encoding="utf-8"))
     assert said["name"] == NAME and said["n_scans"] == 4
     assert said["settings"]["session"]["scans"] == 4 and said["settings"]["seed"] == 3
     assert 0.5 < said["distance_m"] < 5.0 and 0.95 < said["duration_s"] < 1.05
     assert read_settings(folder / "settings.json") == load_settings(recipe)
-    (folder.parent / "settings.json").write_text("{}")
+    (folder.parent / "settings.json").write_text("{}", encoding="utf-8")
     with pytest.raises(SettingsError, match="settings.json: cannot be read"):
         read_settings(folder.parent / "settings.json")
 
@@ -317,7 +319,9 @@ def test_interrupted_session_goes_on_with_the_same_bytes(folder: Path, recipe: P
 def test_changed_settings_start_anew(folder: Path, tmp_path: Path) -> None:
     copy = tmp_path / NAME
     shutil.copytree(folder, copy)
-    (tmp_path / "tiny.yaml").write_text(RECIPE.replace("scans: 4, seed: 2", "scans: 3, seed: 4"))
+    (tmp_path / "tiny.yaml").write_text(
+        RECIPE.replace("scans: 4, seed: 2", "scans: 3, seed: 4"), encoding="utf-8"
+    )
     lines: list[str] = []
     writer.write_session(load_settings(tmp_path / "tiny.yaml"), NAME, tmp_path, lines.append)
     assert lines[0] == f"{NAME}: settings changed (session), starting anew"
@@ -329,15 +333,21 @@ def test_changed_settings_start_anew(folder: Path, tmp_path: Path) -> None:
 
 def test_a_folder_of_someone_else_is_left_alone(recipe: Path, tmp_path: Path) -> None:
     (tmp_path / NAME).mkdir()
-    (tmp_path / NAME / "thesis.txt").write_text("years of work")
-    with pytest.raises(ValueError, match="not empty and without a settings.json"):
-        writer.write_session(load_settings(recipe), NAME, tmp_path)
-    assert (tmp_path / NAME / "thesis.txt").read_text() == "years of work"
+    (tmp_path / NAME / "thesis.txt").write_text("years of work", encoding="utf-8")
+    (tmp_path / NAME / "radar").mkdir()
+    for content in (None, '{"listing": "pairs.json", "settings": {}}', "[]", "{"):
+        for name in ("settings.json", "radar/.1.png.1.tmp"):
+            if content is not None:
+                (tmp_path / NAME / name).write_text(content, encoding="utf-8")
+        with pytest.raises(ValueError, match="not empty and without a settings.json"):
+            writer.write_session(load_settings(recipe), NAME, tmp_path)
+    assert (tmp_path / NAME / "radar/.1.png.1.tmp").is_file()
+    assert (tmp_path / NAME / "thesis.txt").read_text(encoding="utf-8") == "years of work"
 
 
 def test_all_sweeps_can_be_had(recipe: Path) -> None:
     text = RECIPE.replace("  seed: 3\n", "  seed: 3\n  sweeps: all\n")
-    (recipe.parent / "all.yaml").write_text(text)
+    (recipe.parent / "all.yaml").write_text(text, encoding="utf-8")
     session = build_session(load_settings(recipe.parent / "all.yaml"), NAME)
     for sensor in writer.LIDARS:
         assert 22 <= len(session.chosen[sensor]) <= 26  # 1.2 s at 20 Hz

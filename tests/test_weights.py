@@ -20,7 +20,10 @@ WEIGHTS = sorted((Path(__file__).resolve().parents[1] / "data" / "weights").glob
 @pytest.mark.parametrize("path", WEIGHTS, ids=lambda path: path.stem)
 def test_weights_are_small_and_have_a_card_that_fits(path: Path) -> None:
     assert path.stat().st_size < 25e6
-    card, translator = json.loads(path.with_suffix(".json").read_text()), load_translator(path)
+    card, translator = (
+        json.loads(path.with_suffix(".json").read_text(encoding="utf-8")),
+        load_translator(path),
+    )
     assert translator.about["card"] == path.with_suffix(".json").name and card["name"] == path.stem
     assert translator.points == {"threshold": card["threshold"], "thin": card["thin"]}
     assert translator.generator.headings == card["headings"] == card["recipe"]["network"].get("headings", 1)
@@ -48,7 +51,7 @@ def test_the_best_network_beats_raw_peaks_on_real_scans_as_its_card_says(real_ro
         rows.append([judge_on_map(points, scan.pose, tree)["share_1m"] for points in (fake, raw)])
         assert len(fake) >= 300
     fake_share, raw_share = np.mean(rows, axis=0)
-    judged = json.loads(path.with_suffix(".json").read_text())["judged"]
+    judged = json.loads(path.with_suffix(".json").read_text(encoding="utf-8"))["judged"]
     told = next(
         share
         for place, level, share in zip(

@@ -19,6 +19,8 @@ from pathlib import Path
 import nbformat
 import yaml
 
+from rol.files import read_text
+
 ROOT = Path(__file__).resolve().parents[1]
 NOTEBOOKS = ROOT / "notebooks"
 PACKAGE = ROOT / "src" / "rol"
@@ -78,7 +80,7 @@ def load_config(path: str | Path) -> dict:
     ChapterError
         If a key is missing or nobody reads it, or a chapter named in it does not exist.
     """
-    return check_config(yaml.safe_load(Path(path).read_text()), str(path))
+    return check_config(yaml.safe_load(read_text(path, ChapterError)), str(path))
 
 
 def check_config(config: dict, name: str) -> dict:
@@ -298,7 +300,7 @@ def module_files(sources: Iterable[str], package_root: Path = PACKAGE) -> list[P
             if file.is_file() and file not in found:
                 found.add(file)
                 package = file.parent.relative_to(package_root).parts
-                waiting += imported_modules(file.read_text(), package)
+                waiting += imported_modules(file.read_text(encoding="utf-8"), package)
     return sorted(found)
 
 
@@ -310,24 +312,26 @@ def digest(texts: Iterable[str]) -> str:
 def chapter_digest(path: str | Path) -> str:
     """Give the digest of a notebook's code and of the modules it uses; text, comments and outputs do not count."""
     cells = code_cells(read_notebook(path))
-    return digest([*cells, *(code_text(file.read_text()) for file in module_files(cells))])
+    return digest([*cells, *(code_text(file.read_text(encoding="utf-8")) for file in module_files(cells))])
 
 
 def virtual_digest() -> str:
     """Give the digest of all code that makes virtual sessions."""
     files = module_files(["import rol.virtual.__main__"])
-    return digest(code_text(file.read_text()) for file in files)
+    return digest(code_text(file.read_text(encoding="utf-8")) for file in files)
 
 
 def script_digest(name: str) -> str:
     """Give the digest of a script of the workflow and of the modules it uses."""
-    script = (ROOT / "workflow" / name).read_text()
-    return digest(code_text(text) for text in [script, *(f.read_text() for f in module_files([script]))])
+    script = (ROOT / "workflow" / name).read_text(encoding="utf-8")
+    return digest(
+        code_text(text) for text in [script, *(f.read_text(encoding="utf-8") for f in module_files([script]))]
+    )
 
 
 def stored_digest(notebook: nbformat.NotebookNode, config: dict) -> str:
     """Give the digest that a stored notebook carries: its code, all of ``src/rol``, and the profile it was run with."""
-    package = [code_text(file.read_text()) for file in sorted(PACKAGE.rglob("*.py"))]
+    package = [code_text(file.read_text(encoding="utf-8")) for file in sorted(PACKAGE.rglob("*.py"))]
     return digest([*code_cells(notebook), *package, json.dumps(config, sort_keys=True)])
 
 

@@ -19,7 +19,8 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from rol.evaluation import consistency, pose_errors, summarize, write_text
+from rol.evaluation import consistency, pose_errors, summarize
+from rol.files import write_text
 from rol.mcl import MclSettings, settings_for
 from rol.motion import MotionModel
 from rol.rall import find_real_root

@@ -28,6 +28,7 @@ from chapters import (
     stored_digest,
     tagged_cells,
 )
+from rol.files import write_text
 
 LARGEST_MB = 1.5
 KEPT_METADATA = ("kernelspec", "language_info")
@@ -90,9 +91,7 @@ def renew(config_path: str) -> None:
             raise ChapterError(
                 f"{path}: {len(text.encode()) / 1e6:.2f} MB with its outputs; {LARGEST_MB} MB are allowed"
             )
-        part = path.with_suffix(".part")
-        part.write_text(text)
-        part.replace(path)
+        write_text(path, text)
         print(f"renewed: {Path('notebooks', path.name)}")
 
 

@@ -34,6 +34,7 @@ from chapters import (
     load_run,
     tagged_cells,
 )
+from rol.files import read_text, write_text
 from toolbox_pages import stage_toolbox
 
 VERSIONS_SHOWN = "numpy scipy opencv-python-headless numba pandas torch open3d-cpu matplotlib papermill snakemake jupyter-book"
@@ -264,7 +265,7 @@ def stage_settings(book: Path, environment: Mapping[str, str]) -> None:
     more = launch_settings(environment)
     if more:
         path = book / "_config.yml"
-        path.write_text(yaml.safe_dump(yaml.safe_load(path.read_text()) | more, sort_keys=False))
+        write_text(path, yaml.safe_dump(yaml.safe_load(read_text(path)) | more, sort_keys=False))
 
 
 # ---- generated pages ------------------------------------------------------------------------------------------
@@ -272,7 +273,7 @@ def stage_settings(book: Path, environment: Mapping[str, str]) -> None:
 
 def git(*words: str) -> str:
     """Ask git, without minding when there is no repository."""
-    answer = subprocess.run(["git", *words], cwd=ROOT, capture_output=True, text=True, check=False)
+    answer = subprocess.run(["git", *words], cwd=ROOT, capture_output=True, encoding="utf-8", check=False)
     return answer.stdout.strip() if answer.returncode == 0 else ""
 
 
@@ -305,7 +306,7 @@ def how_made_page(config: dict, config_path: str) -> str:
     for run in all_runs(config):
         metadata = nbformat.read(run.path(config["out_dir"]), as_version=4).metadata
         lines.append(f"| {run.chapter} | {run.session} | {run.method} | {metadata.papermill.duration:.0f} |")
-    lines += ["", "## The profile", "", "```yaml", Path(config_path).read_text().strip(), "```", ""]
+    lines += ["", "## The profile", "", "```yaml", read_text(config_path).strip(), "```", ""]
     return "\n".join(lines)
 
 
@@ -314,21 +315,31 @@ def installed(name: str) -> bool:
     return bool(list(importlib.metadata.distributions(name=name)))
 
 
+def clear(book: Path) -> None:
+    """Remove a staged book; refuse a folder that holds files and is not a staged book."""
+    if not (book / "made.md").is_file() and any(path.is_file() for path in book.rglob("*")):
+        raise ChapterError(
+            f"book_dir: {book}: holds files but no made.md, so it is no staged book; left alone"
+        )
+    shutil.rmtree(book, ignore_errors=True)
+    write_text(book / "made.md", "")
+
+
 def stage(config_path: str) -> Path:
     """Stage the whole book of a profile and give its folder."""
     config = load_config(config_path)
     book = Path(config["book_dir"])
-    shutil.rmtree(book, ignore_errors=True)
-    shutil.copytree(ROOT / "book", book)
+    clear(book)
+    shutil.copytree(ROOT / "book", book, dirs_exist_ok=True)
     stage_notebooks(config, book)
     stage_result_figure(config, book)
     modules = stage_toolbox(book)
-    (book / "made.md").write_text(how_made_page(config, config_path))
+    write_text(book / "made.md", how_made_page(config, config_path))
     pages = book_pages(config)
     for page in book.glob("*.md"):
-        page.write_text(point_to_pages(page.read_text(), pages))
-    contents = expand_contents(yaml.safe_load((book / "_toc.yml").read_text()), pages, modules)
-    (book / "_toc.yml").write_text(yaml.safe_dump(contents, sort_keys=False))
+        write_text(page, point_to_pages(read_text(page), pages))
+    contents = expand_contents(yaml.safe_load(read_text(book / "_toc.yml")), pages, modules)
+    write_text(book / "_toc.yml", yaml.safe_dump(contents, sort_keys=False))
     stage_settings(book, os.environ)
     return book
 

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from chapters import PACKAGE, ChapterError
+from rol.files import read_text, write_text
 
 SECTION = re.compile(r"^(Parameters|Attributes|Returns|Yields|Raises|Notes)\n-+$", re.MULTILINE)
 FOLDER = "Part of the folder `virtual`, which is copied whole: [what it needs, and an example](../take.md#virtual)."
@@ -51,7 +52,7 @@ class Example:
 
 def read_examples(page: Path) -> dict[str, Example]:
     """Read the examples of a page: headings that link to a file's page, a line of needs, code, and what it prints."""
-    parts = re.split(r"^### \[(\w+)\]\(.*\)\n", page.read_text(), flags=re.MULTILINE)[1:]
+    parts = re.split(r"^### \[(\w+)\]\(.*\)\n", read_text(page), flags=re.MULTILINE)[1:]
     found = {}
     for name, text in zip(parts[::2], parts[1::2], strict=True):
         needs = re.search(r"^Packages: .*$", text, re.MULTILINE)
@@ -172,7 +173,7 @@ def page_name(file: Path) -> str:
 def public_members(file: Path) -> list[ast.FunctionDef | ast.ClassDef]:
     """List the public functions and classes of a file."""
     kinds = ast.FunctionDef | ast.ClassDef
-    body = ast.parse(file.read_text()).body
+    body = ast.parse(read_text(file)).body
     return [node for node in body if isinstance(node, kinds) and not node.name.startswith("_")]
 
 
@@ -203,7 +204,7 @@ def module_page(file: Path, files: list[Path], example: Example | None) -> str:
     place, links = file.relative_to(PACKAGE).as_posix(), find_links(files, file)
     members = public_members(file)
     lines = [f"# {page_name(file).replace('-', '.')}", ""]
-    lines += docstring_lines(ast.get_docstring(ast.parse(file.read_text())) or "", links)
+    lines += docstring_lines(ast.get_docstring(ast.parse(read_text(file))) or "", links)
     lines += [f"File: `src/rol/{place}`. [How to copy it](../take.md#what-to-copy).", ""]
     if example:
         lines += [
@@ -232,7 +233,7 @@ def index_page(files: list[Path]) -> str:
     """Write the list of all pages, those of the folder `virtual` apart."""
     rows: dict[str, list[str]] = {"": [], "virtual": []}
     for file in files:
-        said = as_text(first_sentence(ast.get_docstring(ast.parse(file.read_text())) or ""), {})
+        said = as_text(first_sentence(ast.get_docstring(ast.parse(read_text(file))) or ""), {})
         row = f"| [{page_name(file).replace('-', '.')}]({page_name(file)}.md) | {said} |"
         rows["virtual" if file.parent != PACKAGE else ""].append(row)
     head = "One page for each file of `src/rol`: what it needs, an example, and every public function with its code."
@@ -247,10 +248,9 @@ def stage_toolbox(book: Path) -> list[str]:
     files = [file for file in sorted(PACKAGE.rglob("*.py")) if not file.name.startswith("__")]
     files.sort(key=lambda file: (len(file.relative_to(PACKAGE).parts), file))
     shutil.copytree(PACKAGE, book / "src" / "rol", ignore=shutil.ignore_patterns("__pycache__"))
-    (book / "toolbox").mkdir()
     examples = read_examples(book / "take.md")
     for file in files:
         example = examples.get(file.stem) if file.parent == PACKAGE else None
-        (book / "toolbox" / f"{page_name(file)}.md").write_text(module_page(file, files, example))
-    (book / "toolbox" / "index.md").write_text(index_page(files))
+        write_text(book / "toolbox" / f"{page_name(file)}.md", module_page(file, files, example))
+    write_text(book / "toolbox" / "index.md", index_page(files))
     return [page_name(file) for file in files]

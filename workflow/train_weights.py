@@ -27,8 +27,9 @@ import numpy as np
 import pandas as pd
 import yaml
 
-from rol.alignment import align_scans, usable_stamps
-from rol.evaluation import read_tum, write_text
+from rol.alignment import align_scans, usable_sweeps
+from rol.evaluation import read_tum
+from rol.files import read_text, write_text
 from rol.oxford import compose_odometry, load_radar_odometry, open_session
 from rol.pairs import estimate_twists, job_of_row
 from rol.scan_pairs import JoinedPairs, ScanPairs, gather_clouds
@@ -51,7 +52,7 @@ def say(line: str) -> None:
 
 def load_recipe(path: Path) -> dict[str, Any]:
     """Read the recipe and refuse one that lacks a part."""
-    recipe = yaml.safe_load(path.read_text(encoding="utf-8"))
+    recipe = yaml.safe_load(read_text(path))
     missing = {"out_dir", "sessions_root", "seed", "pairs", "worlds", "sets", "networks", "ablations"} - set(
         recipe or {}
     )
@@ -82,10 +83,8 @@ def choose_jobs(root: Path, part: dict[str, Any], motion: str) -> tuple[Any, lis
     session = open_session(root / part["session"])
     odometry = load_radar_odometry(session.odometry_path)
     radar_us, mid_us, _ = compose_odometry(odometry)
-    lidar_us = [usable_stamps(session, f"velodyne_{side}") for side in ("left", "right")]
-    rows = align_scans(
-        radar_us, mid_us, estimate_twists(odometry), *lidar_us, motion=motion, max_gap_us=50_000
-    )
+    scans = (radar_us, mid_us, estimate_twists(odometry))
+    rows = align_scans(*scans, usable_sweeps(session), motion=motion, max_gap_us=50_000)
     jobs = [job_of_row(row) for _, row in pd.DataFrame(rows).iterrows()]
     stamps_us, poses = read_tum(session.root / "truth.tum")
     places = poses[np.searchsorted(stamps_us, [job["radar_stamp"] for job in jobs]), :2]
@@ -241,7 +240,7 @@ def judge_again(recipe: dict[str, Any], name: str, sets: dict[str, JoinedPairs],
     """Judge the weights that come with the book and print what their card says beside it; 1 if they differ."""
     from rol.pix2pix import load_weights
 
-    card = json.loads((WEIGHTS / f"{name}.json").read_text())
+    card = json.loads(read_text(WEIGHTS / f"{name}.json"))
     generator = load_weights(WEIGHTS / f"{name}.safetensors")
     tables = [judge(generator, sets, real, recipe["pairs"], card["thin"]), pd.DataFrame(card["judged"])]
     columns = ["n_fake", "fake_to_real_within_1m", "fake_to_real_within_2m", "real_to_fake_within_1m"]
@@ -259,7 +258,7 @@ def judge_again(recipe: dict[str, Any], name: str, sets: dict[str, JoinedPairs],
 
 def is_done(card: Path, asked: dict[str, Any]) -> bool:
     """Say whether a network was trained and judged with these very settings."""
-    return card.is_file() and json.loads(card.read_text())["recipe"]["network"] == asked
+    return card.is_file() and json.loads(read_text(card))["recipe"]["network"] == asked
 
 
 def write_ablations(recipe: dict[str, Any], names: list[str]) -> None:
@@ -268,7 +267,7 @@ def write_ablations(recipe: dict[str, Any], names: list[str]) -> None:
     for name in names:
         path = Path(recipe["out_dir"]) / name / "card.json"
         if path.is_file():
-            card = json.loads(path.read_text())
+            card = json.loads(read_text(path))
             steps = len(card["history"]["step"]) and card["history"]["step"][-1]
             tables.append(
                 pd.DataFrame(card["judged"]).assign(network=name, steps=steps, weights=card["weights"])

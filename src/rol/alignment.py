@@ -42,21 +42,49 @@ def usable_stamps(session: Any, sensor: str) -> np.ndarray:
     there = {p.stem for p in folder.iterdir() if p.suffix in (".png", ".bin")} if folder.is_dir() else set()
     kept = [stamp for stamp in (() if listed is None else listed.tolist()) if str(stamp) in there]
     if not kept:
-        raise ValueError(f"{folder}: no usable frame of {sensor}; a pair needs the radar and both lidars")
+        raise ValueError(f"{folder}: no usable frame of {sensor}; a pair needs the radar and a lidar")
     return np.array(kept, dtype=np.int64)
+
+
+def usable_sweeps(session: Any) -> dict[str, np.ndarray]:
+    """List the usable sweeps of the lidars that a session has.
+
+    Parameters
+    ----------
+    session : rol.oxford.Session
+        The session.
+
+    Returns
+    -------
+    sweeps_us : dict of array, int64
+        "left", "right" or both -> stamps of the sweeps [us], as of `usable_stamps`.
+
+    Raises
+    ------
+    ValueError
+        If neither lidar has a usable sweep; the message names the folders.
+    """
+    found, faults = {}, []
+    for side in ("left", "right"):
+        try:
+            found[side] = usable_stamps(session, f"velodyne_{side}")
+        except ValueError as error:
+            faults.append(str(error))
+    if not found:
+        raise ValueError("; ".join(faults))
+    return found
 
 
 def align_scans(
     radar_us: np.ndarray,
     mid_us: np.ndarray,
     twists: np.ndarray,
-    left_us: np.ndarray,
-    right_us: np.ndarray,
+    sweeps_us: dict[str, np.ndarray],
     *,
     motion: str = "none",
     max_gap_us: int = 50_000,
 ) -> dict[str, np.ndarray]:
-    """Find the sweeps of every scan; scans that lack one of the two are left out.
+    """Find the sweeps of every scan; scans that lack the sweep of a lidar are left out.
 
     Parameters
     ----------
@@ -64,8 +92,8 @@ def align_scans(
         Stamps of the scans and their times at mid-scan [us].
     twists : array, shape (n, 3)
         Body velocities [m/s, m/s, rad/s].
-    left_us, right_us : array, shape (m,), (k,)
-        Stamps of the sweeps [us].
+    sweeps_us : dict of array
+        Stamps of the sweeps [us] by lidar, "left", "right" or both, as from `usable_sweeps`.
     motion : str
         "none" takes the sweeps nearest to the scan's stamp, "corrected" those nearest to mid-scan.
     max_gap_us : int
@@ -75,6 +103,13 @@ def align_scans(
     -------
     columns : dict of arrays, shape (p,)
         The columns of ``alignment.csv``; stamps [us], gaps (sweep minus scan) [ms], velocities [m/s, rad/s].
+        A lidar that the session does not have has no columns.
+
+    Raises
+    ------
+    ValueError
+        If no lidar or an unknown one is given, or no scan has its sweeps within `max_gap_us`; the message gives
+        the smallest gap of each lidar.
 
     Notes
     -----
@@ -84,13 +119,24 @@ def align_scans(
 
     if motion not in ("none", "corrected"):
         raise ValueError(f"motion must be 'none' or 'corrected', not {motion!r}")
+    if not sweeps_us or not sweeps_us.keys() <= {"left", "right"}:
+        raise ValueError(f"sweeps_us must have the keys 'left', 'right' or both, not {list(sweeps_us)}")
     reference = radar_us if motion == "none" else mid_us
-    matches = [(us, *associate_nearest(reference, us, max_gap_us)) for us in (left_us, right_us)]
-    kept = (matches[0][1] >= 0) & (matches[1][1] >= 0)
+    matches = {side: associate_nearest(reference, us, max_gap_us) for side, us in sweeps_us.items()}
+    kept = np.all([index >= 0 for index, _ in matches.values()], axis=0)
+    if not kept.any():
+        least = ", ".join(
+            f"{side} {(np.abs(gap) / 1e3).min(initial=np.inf):g} ms" for side, (_, gap) in matches.items()
+        )
+        place = "its stamp" if motion == "none" else "mid-scan"
+        raise ValueError(
+            f"motion {motion!r}: no scan has its sweeps within {max_gap_us / 1000:g} ms of {place};"
+            f" the smallest gaps are {least}"
+        )
     columns = {"radar_stamp_us": radar_us[kept], "mid_stamp_us": mid_us[kept]}
-    for side, (us, index, _) in zip(("left", "right"), matches, strict=True):
-        columns[f"{side}_stamp_us"] = us[index[kept]]
-    for side, (_, _, gap_us) in zip(("left", "right"), matches, strict=True):
+    for side, (index, _) in matches.items():
+        columns[f"{side}_stamp_us"] = sweeps_us[side][index[kept]]
+    for side, (_, gap_us) in matches.items():
         columns[f"{side}_gap_ms"] = gap_us[kept] / 1000.0
     for i, name in enumerate(("vx_mps", "vy_mps", "yaw_rate_radps")):
         columns[name] = twists[kept, i]

@@ -8,15 +8,16 @@ file one with parameters. Trajectories are written in the TUM format, which ``ev
 from __future__ import annotations
 
 import json
-import os
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 
 try:
+    from .files import read_text, write_text
     from .geometry import check_poses, relative_pose, wrap_angle
 except ImportError:  # this file was copied on its own
+    from files import read_text, write_text
     from geometry import check_poses, relative_pose, wrap_angle
 
 CLASSES = ((1.0, 2.0), (2.0, 5.0), (5.0, 10.0))  # limits of Table III: position [m], heading [deg]
@@ -368,23 +369,6 @@ def drift(estimate: np.ndarray, truth: np.ndarray, lengths_m: tuple[float, ...] 
     return drift_by_length(estimate, truth, lengths_m).mean_translation_pct / 100.0
 
 
-def write_text(path: Path | str, text: str) -> None:
-    """Write a text file that appears whole or not at all: to a temporary name beside it, then renamed.
-
-    Parameters
-    ----------
-    path : Path or str
-        File to write; its folder is made if need be.
-    text : str
-        Content.
-    """
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    temporary.write_text(text)
-    os.replace(temporary, path)
-
-
 def write_tum(path: Path | str, stamps_us: np.ndarray, poses: np.ndarray) -> None:
     """Write a trajectory in the TUM format: time [s], x y z [m], quaternion x y z w, z and the tilt zero.
 
@@ -429,18 +413,22 @@ def read_tum(path: Path | str) -> tuple[np.ndarray, np.ndarray]:
     Raises
     ------
     EvaluationError
-        If a line has not eight numbers, a value is not finite, or times do not increase.
+        If a line does not have eight numbers, a quaternion is not a unit quaternion (within 0.01), a value is
+        not finite, or times do not increase.
     """
-    lines = [
-        line.split() for line in Path(path).read_text().splitlines() if line and not line.startswith("#")
-    ]
-    for number, line in enumerate(lines, start=1):
-        if len(line) != 8:
-            raise EvaluationError(f"{path}: pose {number} has {len(line)} values instead of 8")
-    try:
-        table = np.array(lines, dtype=np.float64).reshape(-1, 8)
-    except ValueError as error:
-        raise EvaluationError(f"{path}: {error}") from error
+    rows = []
+    for number, line in enumerate(read_text(path, EvaluationError).splitlines(), start=1):
+        words = line.partition("#")[0].split()
+        if words and len(words) != 8:
+            raise EvaluationError(f"{path}: line {number} has {len(words)} values instead of 8")
+        try:
+            rows += [[float(word) for word in words]] if words else []
+        except ValueError as error:
+            raise EvaluationError(f"{path}: line {number}: {error}") from error
+        norm = np.linalg.norm(rows[-1][4:]) if words else 1.0
+        if abs(norm - 1.0) > 0.01:
+            raise EvaluationError(f"{path}: line {number}: norm of the quaternion is {norm:.3g}, not 1")
+    table = np.array(rows, dtype=np.float64).reshape(-1, 8)
     poses = np.stack([table[:, 1], table[:, 2], 2.0 * np.arctan2(table[:, 6], table[:, 7])], axis=1)
     poses[:, 2] = (poses[:, 2] + np.pi) % (2.0 * np.pi) - np.pi
     _check_trajectory(path, table[:, 0], poses)
@@ -492,8 +480,8 @@ def read_metrics(path: Path | str) -> dict[str, str | int | float]:
         If the file is no json, or its keys or values are not those of a run.
     """
     try:
-        metrics = json.loads(Path(path).read_text())
-    except json.JSONDecodeError as error:
+        metrics = json.loads(read_text(path))
+    except ValueError as error:
         raise EvaluationError(f"{path}: not a whole json file ({error})") from error
     _check_metrics(path, metrics)
     return metrics

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,14 +16,19 @@ from typing import TYPE_CHECKING, Any
 import cv2
 import numpy as np
 
+try:
+    from .files import prepare_images, read_text, write_bytes, write_text
+except ImportError:  # this file was copied on its own
+    from files import prepare_images, read_text, write_bytes, write_text
+
 if TYPE_CHECKING:
     from .pix2pix import ResnetGenerator
 
 
 def prepare_fakes(folder: str | Path, settings: dict[str, Any]) -> set[int]:
-    """Make a folder ready for fakes of these settings and tell which ones it already holds.
+    """Prepare a folder for generated images of these settings and list those it already holds.
 
-    Fakes made with other settings are removed.
+    Images made with other settings are removed.
 
     Parameters
     ----------
@@ -36,17 +40,14 @@ def prepare_fakes(folder: str | Path, settings: dict[str, Any]) -> set[int]:
     Returns
     -------
     stamps_us : set of int
-        Radar stamps of the fakes that are there [us].
+        Radar stamps of the images that are there [us].
+
+    Raises
+    ------
+    ValueError
+        If the folder is not empty and was not prepared by this function; nothing is removed.
     """
-    folder = Path(folder)
-    folder.mkdir(parents=True, exist_ok=True)
-    (folder / "fake.json").unlink(missing_ok=True)
-    marker, text = folder / "settings.json", json.dumps(settings, indent=1, sort_keys=True)
-    if not marker.is_file() or marker.read_text() != text:
-        for path in folder.glob("*.png"):
-            path.unlink()
-        _write_bytes(marker, text.encode())
-    return {int(path.stem) for path in folder.glob("*.png") if path.stem.isdigit()}
+    return prepare_images(folder, settings, (".",), "fake.json")
 
 
 def translate_session(
@@ -89,13 +90,14 @@ def translate_session(
     from .pairs import list_pairs
     from .pix2pix import has_bf16
 
-    stamps_us, described = list_pairs(pairs), json.loads((Path(pairs) / "pairs.json").read_text())["settings"]
+    stamps_us = list_pairs(pairs)
+    described = json.loads((Path(pairs) / "pairs.json").read_text(encoding="utf-8"))["settings"]
     translator = load_translator(weights)
     points = translator.points | ({"threshold": threshold} if threshold else {})
     checksum = hashlib.sha256(Path(weights).read_bytes()).hexdigest()
     settings = {"weights": checksum, "bf16": bf16, "pairs": described}
     whole = Path(folder) / "fake.json"
-    if whole.is_file() and whole.read_text() == _describe_fakes(settings, stamps_us, points):
+    if whole.is_file() and whole.read_text(encoding="utf-8") == _describe_fakes(settings, stamps_us, points):
         yield from stamps_us
         return
     there, bf16 = prepare_fakes(folder, settings), bf16 and has_bf16(device)
@@ -138,7 +140,7 @@ def write_fakes(
     for stamp in stamps_us:
         radar = read_image(Path(pairs) / "radar" / f"{int(stamp)}.png")
         fake = generate(generator, radar, bf16=bf16)
-        _write_bytes(Path(folder) / f"{int(stamp)}.png", cv2.imencode(".png", fake)[1].tobytes())
+        write_bytes(Path(folder) / f"{int(stamp)}.png", cv2.imencode(".png", fake)[1].tobytes())
         yield int(stamp)
 
 
@@ -167,7 +169,7 @@ def finish_fakes(
         path = Path(folder) / f"{int(stamp)}.png"
         if not path.is_file():
             raise ValueError(f"{path}: missing, the fakes are not complete")
-    _write_bytes(Path(folder) / "fake.json", _describe_fakes(settings, stamps_us, points).encode())
+    write_text(Path(folder) / "fake.json", _describe_fakes(settings, stamps_us, points))
 
 
 def list_fakes(folder: str | Path) -> tuple[list[int], dict[str, Any]]:
@@ -194,7 +196,7 @@ def list_fakes(folder: str | Path) -> tuple[list[int], dict[str, Any]]:
     if not path.is_file():
         raise ValueError(f"{path}: missing; chapter 05 writes it when all fakes of the session are there")
     try:
-        about = json.loads(path.read_text())
+        about = json.loads(read_text(path))
         return [int(stamp) for stamp in about["stamps_us"]], dict(about["points"])
     except (ValueError, KeyError, TypeError) as error:
         raise ValueError(f"{path}: not a list of fakes ({error})") from error
@@ -230,7 +232,7 @@ def read_points(
 
     folder = Path(folder)
     how = list_fakes(folder)[1]
-    pairs = json.loads((folder / "fake.json").read_text())["settings"].get("pairs", {})
+    pairs = json.loads((folder / "fake.json").read_text(encoding="utf-8"))["settings"].get("pairs", {})
     if twists is None or pairs.get("motion") == "corrected":
         twists = [None] * len(stamps_us)
     for stamp, twist in zip(stamps_us, twists, strict=True):
@@ -270,10 +272,3 @@ def _describe_fakes(settings: dict[str, Any], stamps_us: Sequence[int], points: 
     """Put down what ``fake.json`` holds."""
     about = {"settings": settings, "points": points, "stamps_us": [int(stamp) for stamp in stamps_us]}
     return json.dumps(about, indent=1, sort_keys=True)
-
-
-def _write_bytes(path: Path, data: bytes) -> None:
-    """Write a file under a temporary name in its folder, then rename it."""
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    temporary.write_bytes(data)
-    os.replace(temporary, path)

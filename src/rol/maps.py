@@ -7,7 +7,7 @@ onto the session's poses, gives them in the first map's frame.
 
 from __future__ import annotations
 
-import os
+import io
 import zipfile
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -17,8 +17,10 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 try:
+    from .files import write_bytes
     from .geometry import check_poses, compose, transform_points
 except ImportError:  # this file was copied on its own
+    from files import write_bytes
     from geometry import check_poses, compose, transform_points
 
 
@@ -262,12 +264,10 @@ def save_map(path: Path | str, points: np.ndarray, T_map_session: np.ndarray) ->
     MapError
         If there is no point or a value is not finite.
     """
-    path = Path(path)
     _check_map(path, points, T_map_session)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.npz")
-    np.savez_compressed(temporary, points=points, T_map_session=np.asarray(T_map_session, dtype=np.float64))
-    os.replace(temporary, path)
+    content = io.BytesIO()
+    np.savez_compressed(content, points=points, T_map_session=np.asarray(T_map_session, dtype=np.float64))
+    write_bytes(path, content.getvalue())
 
 
 def load_map(path: Path | str) -> tuple[np.ndarray, np.ndarray]:

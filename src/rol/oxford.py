@@ -13,6 +13,7 @@ from __future__ import annotations
 import io
 import os
 import zlib
+from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -21,8 +22,10 @@ import numpy as np
 import pandas as pd
 
 try:
+    from .files import read_text, write_bytes, write_text
     from .geometry import accumulate_steps, flip_y_z, interpolate_poses, transform_from_euler
 except ImportError:  # this file was copied on its own
+    from files import read_text, write_bytes, write_text
     from geometry import accumulate_steps, flip_y_z, interpolate_poses, transform_from_euler
 
 N_AZIMUTHS, N_BINS, N_HEADER = (
@@ -81,16 +84,13 @@ def _read_bytes(path: Path | str) -> bytes:
     return data
 
 
-def _write_bytes(path: Path | str, data: bytes) -> None:
-    """Write a file under a temporary name in its folder, then rename it; the folder is made if need be."""
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
-        temporary.write_bytes(data)
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
+def _read_text(path: Path | str) -> str:
+    """Read a text file; one that is missing, empty or not UTF-8 is an OxfordError."""
+    _read_bytes(path)
+    text = read_text(path, OxfordError)
+    if not text:
+        raise OxfordError(f"{path}: file is empty")
+    return text
 
 
 def _is_whole_png(data: bytes) -> bool:
@@ -136,7 +136,7 @@ def _write_png(path: Path | str, image: np.ndarray) -> None:
     is_done, data = cv2.imencode(".png", image, options)
     if not is_done:
         raise OxfordError(f"{path}: image of shape {image.shape} cannot be encoded")
-    _write_bytes(path, data.tobytes())
+    write_bytes(path, data.tobytes())
 
 
 def _cast(path: Path | str, name: str, values: np.ndarray, dtype: type, shape: tuple[int, ...]) -> np.ndarray:
@@ -402,7 +402,7 @@ def save_velodyne_binary(path: Path | str, points: np.ndarray) -> None:
     if points.ndim != 2 or points.shape[1] != 4 or len(points) == 0:
         raise OxfordError(f"{path}: expected points of shape (n, 4) with n > 0, got {points.shape}")
     _check_points(path, points)
-    _write_bytes(path, np.ascontiguousarray((points * np.float32([1, -1, -1, 1])).T).tobytes())
+    write_bytes(path, np.ascontiguousarray((points * np.float32([1, -1, -1, 1])).T).tobytes())
 
 
 # ---- text files ----
@@ -437,7 +437,7 @@ def load_timestamps(path: Path | str) -> tuple[np.ndarray, np.ndarray]:
     OxfordError
         If the file is missing or empty, a line is not a stamp and a flag 0 or 1, or stamps do not increase.
     """
-    lines = [line.split() for line in _read_bytes(path).decode("ascii", "replace").splitlines()]
+    lines = [line.split() for line in _read_text(path).splitlines()]
     for number, fields in enumerate(lines, 1):
         is_good = (
             len(fields) == 2 and fields[0].isdecimal() and len(fields[0]) < 19 and fields[1] in ("0", "1")
@@ -461,7 +461,7 @@ def save_timestamps(path: Path | str, stamps_us: np.ndarray, valid: np.ndarray |
         )
     _check_increasing(path, stamps, first_line=1)
     lines = [f"{stamp} {flag:d}\n" for stamp, flag in zip(stamps.tolist(), flags.tolist(), strict=True)]
-    _write_bytes(path, "".join(lines).encode())
+    write_text(path, "".join(lines))
 
 
 def _column_type(name: str) -> type:
@@ -489,11 +489,13 @@ def _check_table(path: Path | str, table: pd.DataFrame, columns: list[str]) -> N
 
 def _load_table(path: Path | str, columns: list[str]) -> pd.DataFrame:
     """Read one of Oxford's csv files with known columns."""
-    text = _read_bytes(path).decode("utf-8", "replace")
+    text = _read_text(path)
     lines = text.splitlines()
-    missing = [name for name in columns if name not in lines[0].split(",")]
-    if missing:
-        raise OxfordError(f"{path}: missing columns: {', '.join(missing)}")
+    there = Counter(lines[0].split(","))
+    odd = {"missing": Counter(columns) - there, "unknown or doubled": there - Counter(columns)}
+    faults = [f"{kind} columns: {', '.join(names.elements())}" for kind, names in odd.items() if names]
+    if faults:
+        raise OxfordError(f"{path}: {'; '.join(faults)}")
     if not text.endswith("\n"):
         raise OxfordError(f"{path}: the last line is cut off (no line end): {lines[-1][-60:]!r}")
     for number, line in enumerate(lines, 1):
@@ -515,7 +517,7 @@ def _save_table(path: Path | str, table: pd.DataFrame, columns: list[str], stamp
     fields = {name: _cast(path, name, table[name].to_numpy(), np.int64, (len(table),)) for name in counts}
     fields[columns[0]] = [f"{stamp:0{stamp_digits}d}" for stamp in fields[columns[0]].tolist()]
     text = table.assign(**fields).to_csv(index=False, float_format="%.6f", lineterminator="\n")
-    _write_bytes(path, text.encode())
+    write_text(path, text)
 
 
 def load_gps(path: Path | str) -> pd.DataFrame:
@@ -591,7 +593,7 @@ def load_extrinsics(path: Path | str) -> np.ndarray:
     OxfordError
         If the file is missing or is not six finite numbers.
     """
-    text = _read_bytes(path).decode("ascii", "replace")
+    text = _read_text(path)
     try:
         values = np.array(text.split(), dtype=np.float64)
     except ValueError:
@@ -609,7 +611,7 @@ def save_extrinsics(path: Path | str, T_vehicle_sensor: np.ndarray) -> None:
     values = np.round([*T[:3, 3], roll, pitch, yaw], 10) + 0.0  # plus zero: no "-0"
     if not np.isfinite(values).all():
         raise OxfordError(f"{path}: T_vehicle_sensor: a value is not finite")
-    _write_bytes(path, (" ".join(f"{value:.10g}" for value in values) + "\n").encode())
+    write_text(path, " ".join(f"{value:.10g}" for value in values) + "\n")
 
 
 # ---- radar odometry ----
@@ -858,14 +860,15 @@ def open_session(path: Path | str) -> Session:
         If there is no such session or it is incomplete; the message lists the sessions beside it.
     """
     root = Path(os.path.abspath(path))
-    needed = ["radar", "radar.timestamps"] + (["session.json"] if root.name.startswith("virtual-") else [])
-    missing = [name for name in needed if not (root / name).exists()]
+    files = ["radar.timestamps"] + (["session.json"] if root.name.startswith("virtual-") else [])
+    missing = [] if (root / "radar").is_dir() else ["radar"]
+    missing += [name for name in files if not (root / name).is_file()]
     if missing:
         fault = f"incomplete session, {', '.join(missing)} missing" if root.is_dir() else "no such session"
         others = ", ".join(name for name in list_sessions(root.parent) if name != root.name) or "none"
         raise OxfordError(f"{path}: {fault}; sessions beside it: {others}")
     listings = [Path(path) / f"{sensor}.timestamps" for sensor in SENSORS]
-    loaded = [load_timestamps(listing) if listing.exists() else None for listing in listings]
+    loaded = [load_timestamps(listing) if listing.is_file() else None for listing in listings]
     return Session(Path(path), root.name, *(None if pair is None else pair[0][pair[1]] for pair in loaded))
 
 
@@ -908,11 +911,16 @@ def _describe(path: Path, items: np.ndarray | list, what: str) -> list[str]:
 def _find_sensor_faults(session: Session, sensor: str) -> list[str]:
     """Compare a sensor's list of stamps with its files; name flags of 0 and gaps."""
     listing, folder = session.root / f"{sensor}.timestamps", session.root / sensor
-    missing = [f"{path}: missing" for path in (listing, folder) if not path.exists()]
+    found = ((listing, "file", listing.is_file()), (folder, "folder", folder.is_dir()))
+    missing = [
+        (path, f"not a {kind}" if path.exists() else "missing")
+        for path, kind, is_there in found
+        if not is_there
+    ]
     if missing:
-        return missing
+        return [f"{path}: {fault}" for path, fault in missing]
     stamps, valid = load_timestamps(listing)
-    sizes = {entry.name: entry.stat().st_size for entry in os.scandir(folder)}
+    sizes = {entry.name: entry.is_file() and entry.stat().st_size for entry in os.scandir(folder)}
     suffixes = (".png",) if sensor == "radar" else (".png", ".bin")
     frames = {name for name in sizes if name.endswith(suffixes) and name[:-4].isdecimal() and len(name) < 23}
     on_disk = np.unique(np.array([int(name[:-4]) for name in frames], dtype=np.int64))

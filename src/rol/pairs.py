@@ -10,8 +10,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
-import shutil
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
@@ -20,6 +18,11 @@ from typing import Any
 
 import cv2
 import numpy as np
+
+try:
+    from .files import prepare_images, read_text, write_bytes, write_text
+except ImportError:  # this file was copied on its own
+    from files import prepare_images, read_text, write_bytes, write_text
 
 SIDES = ("radar", "lidar")
 
@@ -116,30 +119,31 @@ def job_of_row(row: Any) -> dict[str, Any]:
     -------
     job : dict
         ``radar_stamp``, ``left_stamp``, ``right_stamp``, ``mid_stamp_us`` [us] and ``twist`` [m/s, m/s,
-        rad/s].
+        rad/s]. The stamp of a lidar that has no column is None.
     """
-    names = ("radar", "left", "right")
-    job: dict[str, Any] = {f"{name}_stamp": int(row[f"{name}_stamp_us"]) for name in names}
+    job: dict[str, Any] = {"radar_stamp": int(row["radar_stamp_us"])}
+    for name in ("left", "right"):
+        job[f"{name}_stamp"] = int(row[f"{name}_stamp_us"]) if f"{name}_stamp_us" in row else None
     twist = tuple(float(row[name]) for name in ("vx_mps", "vy_mps", "yaw_rate_radps"))
     return {**job, "mid_stamp_us": int(row["mid_stamp_us"]), "twist": twist}
 
 
 def load_lidar_points(
     session: Any,
-    left_stamp: int,
-    right_stamp: int,
+    left_stamp: int | None,
+    right_stamp: int | None,
     *,
     mid_stamp_us: int | None = None,
     twist: np.ndarray | Sequence[float] | None = None,
 ) -> np.ndarray:
-    """Load one sweep of each lidar and bring both into the radar frame.
+    """Load one sweep of each lidar and transform them into the radar frame.
 
     Parameters
     ----------
     session : rol.oxford.Session
         The session.
-    left_stamp, right_stamp : int
-        Stamps of the two sweeps [us].
+    left_stamp, right_stamp : int or None
+        Stamps of the two sweeps [us]; None for a lidar that the session does not have.
     mid_stamp_us : int, optional
         Time at which the radar frame is meant; needed with a twist [us].
     twist : array-like, shape (3,), optional
@@ -148,7 +152,12 @@ def load_lidar_points(
     Returns
     -------
     points : array, shape (n, 4)
-        x, y, z [m] and intensity of both sweeps in the radar frame, the left one first.
+        x, y, z [m] and intensity of the sweeps in the radar frame, the left one first.
+
+    Raises
+    ------
+    ValueError
+        If there is a twist and no ``mid_stamp_us``, or no sweep of either lidar.
     """
     from .lidar import relate_sensors, sweep_to_radar
     from .oxford import EXTRINSICS, load_sweep
@@ -156,8 +165,12 @@ def load_lidar_points(
 
     if twist is not None and mid_stamp_us is None:
         raise ValueError("a twist needs mid_stamp_us, the time to move the points to")
+    stamps = {"velodyne_left": left_stamp, "velodyne_right": right_stamp}
+    sweeps = [(sensor, stamp) for sensor, stamp in stamps.items() if stamp is not None]
+    if not sweeps:
+        raise ValueError(f"{session.name}: left_stamp and right_stamp are None; one lidar is needed")
     clouds = []
-    for sensor, stamp in (("velodyne_left", left_stamp), ("velodyne_right", right_stamp)):
+    for sensor, stamp in sweeps:
         points, stamps_us = load_sweep(session, sensor, int(stamp))
         points = sweep_to_radar(points, relate_sensors(EXTRINSICS["radar"], EXTRINSICS[sensor]))
         if twist is not None:
@@ -169,8 +182,8 @@ def load_lidar_points(
 def build_pair(
     session: Any,
     radar_stamp: int,
-    left_stamp: int,
-    right_stamp: int,
+    left_stamp: int | None,
+    right_stamp: int | None,
     *,
     motion: str = "none",
     mid_stamp_us: int | None = None,
@@ -190,7 +203,7 @@ def build_pair(
     session : rol.oxford.Session
         The session.
     radar_stamp, left_stamp, right_stamp : int
-        Stamps of the scan and of its two sweeps [us].
+        Stamps of the scan and of its two sweeps [us]; None for a lidar that the session does not have.
     motion : str
         "none" takes scan and sweeps as they are; "corrected" brings both to mid-scan, the scan with its
         Doppler shift taken out.
@@ -243,7 +256,7 @@ def build_pair(
 
 
 def save_pair(folder: str | Path, stamp_us: int, radar_image: np.ndarray, lidar_image: np.ndarray) -> None:
-    """Write both images of a pair as PNG, each under a temporary name first.
+    """Write both images of a pair as PNG, each whole or not at all.
 
     Parameters
     ----------
@@ -258,8 +271,7 @@ def save_pair(folder: str | Path, stamp_us: int, radar_image: np.ndarray, lidar_
         path = _image_path(folder, side, stamp_us)
         if image.dtype != np.uint8 or image.ndim != 2:
             raise ValueError(f"{path}: expected a uint8 image (h, w), got {image.dtype} {image.shape}")
-        path.parent.mkdir(parents=True, exist_ok=True)
-        _write_bytes(path, cv2.imencode(".png", image)[1].tobytes())
+        write_bytes(path, cv2.imencode(".png", image)[1].tobytes())
 
 
 def load_pair(folder: str | Path, stamp_us: int) -> tuple[np.ndarray, np.ndarray]:
@@ -325,7 +337,7 @@ def describe_pairs(session: Any, alignment_path: str | Path, settings: dict[str,
 
 
 def prepare_pairs(folder: str | Path, settings: dict[str, Any]) -> set[int]:
-    """Make a folder ready for pairs of these settings and tell which ones it already holds.
+    """Prepare a folder for pairs of these settings and list those it already holds.
 
     Pairs made with other settings are removed.
 
@@ -340,17 +352,13 @@ def prepare_pairs(folder: str | Path, settings: dict[str, Any]) -> set[int]:
     -------
     stamps_us : set of int
         Radar stamps of pairs that are complete [us].
+
+    Raises
+    ------
+    ValueError
+        If the folder is not empty and was not prepared by this function; nothing is removed.
     """
-    folder = Path(folder)
-    (folder / "pairs.json").unlink(missing_ok=True)
-    marker, text = folder / "settings.json", json.dumps(settings, indent=1, sort_keys=True)
-    if not marker.is_file() or marker.read_text() != text:
-        for side in SIDES:
-            shutil.rmtree(folder / side, ignore_errors=True)
-        folder.mkdir(parents=True, exist_ok=True)
-        _write_bytes(marker, text.encode())
-    names = [{path.stem for path in (folder / side).glob("*.png") if path.stem.isdigit()} for side in SIDES]
-    return {int(name) for name in names[0] & names[1]}
+    return prepare_images(folder, settings, SIDES, "pairs.json")
 
 
 def write_pairs(
@@ -408,7 +416,7 @@ def finish_pairs(folder: str | Path, settings: dict[str, Any], stamps_us: Sequen
     text = json.dumps(
         {"settings": settings, "stamps_us": [int(s) for s in stamps_us]}, indent=1, sort_keys=True
     )
-    _write_bytes(Path(folder) / "pairs.json", text.encode())
+    write_text(Path(folder) / "pairs.json", text)
 
 
 def list_pairs(folder: str | Path) -> list[int]:
@@ -433,7 +441,7 @@ def list_pairs(folder: str | Path) -> list[int]:
     if not path.is_file():
         raise ValueError(f"{path}: missing; chapter 03 writes it when all pairs of the session are there")
     try:
-        return [int(stamp) for stamp in json.loads(path.read_text())["stamps_us"]]
+        return [int(stamp) for stamp in json.loads(read_text(path))["stamps_us"]]
     except (ValueError, KeyError, TypeError) as error:
         raise ValueError(f"{path}: not a list of pairs ({error})") from error
 
@@ -480,10 +488,3 @@ def _write_one(task: tuple[Any, str | Path, dict[str, Any]]) -> int:
 
 def _image_path(folder: str | Path, side: str, stamp_us: int) -> Path:
     return Path(folder) / side / f"{int(stamp_us)}.png"
-
-
-def _write_bytes(path: Path, data: bytes) -> None:
-    """Write a file under a temporary name in its folder, then rename it."""
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    temporary.write_bytes(data)
-    os.replace(temporary, path)

@@ -14,7 +14,6 @@ There is no dropout: nothing is drawn after the first weights but the order of t
 from __future__ import annotations
 
 import json
-import os
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,9 +22,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
+from safetensors.torch import save
 from torch import Tensor, nn
 from torch.nn import functional
+
+try:
+    from .files import write_bytes
+except ImportError:  # this file was copied on its own
+    from files import write_bytes
 
 if TYPE_CHECKING:
     from .unet import UnetGenerator
@@ -570,17 +574,12 @@ def load_weights(
     Raises
     ------
     Pix2PixError
-        If the file is missing, truncated, of another architecture, width, depth, or does not hold the weights
-        that its header promises; the message names the file.
+        If the file is missing, truncated, of another architecture, width, depth, does not hold the weights that
+        its header promises, or holds a value that is not finite; the message names the file.
     """
     tensors, about = load_tensors(Path(path))
-    network = next(
-        (name for name, words in ARCHITECTURES.items() if words == about.get("architecture")), None
-    )
-    if network is None:
-        raise Pix2PixError(
-            f"{path}: architecture {about.get('architecture')!r}, known are {list(ARCHITECTURES.values())}"
-        )
+    _check_header(path, about)
+    network = next(name for name, words in ARCHITECTURES.items() if words == about["architecture"])
     for name, wanted in (("filters", filters), ("blocks", blocks)):
         if wanted is not None and about[name] != wanted:
             raise Pix2PixError(f"{path}: generator with {about[name]} {name}, expected {wanted}")
@@ -589,7 +588,7 @@ def load_weights(
         generator.load_state_dict(tensors)
     except RuntimeError as error:
         raise Pix2PixError(f"{path}: tensors do not fit the header's architecture ({error})") from error
-    generator.image_size = None if about["image_size"] is None else tuple(about["image_size"])
+    generator.image_size = tuple(about["image_size"]) if about.get("image_size") else None
     generator.headings = int(about.get("headings", 1))
     if network == "unet":
         from .unet import fuse
@@ -615,7 +614,7 @@ def load_metadata(path: str | Path) -> dict[str, Any]:
 
 
 def save_tensors(path: Path, tensors: dict[str, Tensor], about: dict[str, Any]) -> None:
-    """Write tensors and a header under a temporary name, then rename.
+    """Write tensors and a header into a file that appears whole or not at all.
 
     Parameters
     ----------
@@ -625,12 +624,15 @@ def save_tensors(path: Path, tensors: dict[str, Tensor], about: dict[str, Any]) 
         Named tensors, no pickle.
     about : dict
         Header, JSON values only.
+
+    Raises
+    ------
+    Pix2PixError
+        If a value is not finite; the message names the tensor.
     """
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     plain = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
-    save_file(plain, temporary, {"rol": json.dumps(about, sort_keys=True)})
-    os.replace(temporary, path)
+    _check_finite(path, plain)
+    write_bytes(path, save(plain, {"rol": json.dumps(about, sort_keys=True)}))
 
 
 def load_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
@@ -639,7 +641,7 @@ def load_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
     Raises
     ------
     Pix2PixError
-        If the file is missing, not whole, or written by something else.
+        If the file is missing, not whole, or written by something else, or if a value is not finite.
     """
     if not path.is_file():
         raise Pix2PixError(f"{path}: no such weights file")
@@ -651,4 +653,34 @@ def load_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
         raise Pix2PixError(f"{path}: not a whole safetensors file ({error})") from error
     if about is None:
         raise Pix2PixError(f"{path}: header says nothing of the network, so not written by rol.pix2pix")
-    return tensors, json.loads(about)
+    try:
+        header = json.loads(about)
+    except ValueError as error:
+        raise Pix2PixError(f"{path}: header is not whole JSON ({error})") from error
+    if not isinstance(header, dict):
+        raise Pix2PixError(f"{path}: header is {header!r:.60}, not a JSON object")
+    _check_finite(path, tensors)
+    return tensors, header
+
+
+def _check_finite(path: Path, tensors: dict[str, Tensor]) -> None:
+    """Refuse tensors with a value that is not finite."""
+    for name, tensor in tensors.items():
+        if not torch.isfinite(tensor).all():
+            raise Pix2PixError(f"{path}: tensor {name!r} holds a value that is not finite")
+
+
+def _check_header(path: str | Path, about: dict[str, Any]) -> None:
+    """Refuse a header without a known architecture or with sizes of another type."""
+    if about.get("architecture") not in ARCHITECTURES.values():
+        known = list(ARCHITECTURES.values())
+        raise Pix2PixError(f"{path}: architecture {about.get('architecture')!r}, known are {known}")
+    size = about.get("image_size")
+    if size is not None and not (isinstance(size, list) and len(size) == 2):
+        raise Pix2PixError(f"{path}: header: image_size is {size!r}, expected two numbers or null")
+    numbers = {name: about.get(name) for name in ("filters", "blocks")} | {
+        "headings": about.get("headings", 1)
+    }
+    for name, number in [*numbers.items(), *(("image_size", n) for n in size or ())]:
+        if type(number) is not int or number < 0:
+            raise Pix2PixError(f"{path}: header: {name} is {number!r}, expected a whole number")

@@ -13,6 +13,11 @@ from pathlib import Path
 
 import numpy as np
 
+try:
+    from .files import read_text
+except ImportError:  # this file was copied on its own
+    from files import read_text
+
 PAIRS_PATH = Path("radiate_sdk/data/radiate/tiny_foggy")
 CALIBRATION_PATH = Path("radiate_sdk/config/default-calib.yaml")
 RANGE_RESOLUTION = 0.17361  # length of a bin [m], as the data set states it
@@ -92,7 +97,7 @@ def _load_times(path: Path) -> dict[str, float]:
     """Number of a file -> its time [s]."""
     if not path.is_file():
         raise RadiateError(f"{path}: missing")
-    found = re.findall(r"Frame: (\d+) Time: ([\d.]+)", path.read_text(encoding="utf-8"))
+    found = re.findall(r"Frame: (\d+) Time: ([\d.]+)", read_text(path, RadiateError))
     if not found:
         raise RadiateError(f"{path}: holds no line 'Frame: NUMBER Time: SECONDS'")
     return {number: float(seconds) for number, seconds in found}
@@ -103,7 +108,7 @@ def _load_lidar_place(path: Path) -> np.ndarray:
     import yaml
 
     try:
-        place = yaml.safe_load(path.read_text(encoding="utf-8"))["lidar_calib"]["T"]
+        place = yaml.safe_load(read_text(path))["lidar_calib"]["T"]
         right, forward, up = (float(value) for value in place)
     except (OSError, KeyError, TypeError, ValueError, yaml.YAMLError) as error:
         raise RadiateError(f"{path}: holds no lidar_calib with T of three numbers ({error})") from error

@@ -14,6 +14,11 @@ from pathlib import Path
 
 import numpy as np
 
+try:
+    from .files import read_text
+except ImportError:  # this file was copied on its own
+    from files import read_text
+
 MAP_PATH = Path("RaLL/data/maps/RobotCar/png/oxford_laser_map.png")
 POSES_PATH = Path("RaLL/data/gt_poses/RobotCar")
 ODOMETRY_PATH = Path("RaLL/data/odom/RobotCar")
@@ -182,7 +187,10 @@ def load_scan_poses(path: Path | str) -> dict[int, np.ndarray]:
     path, poses = Path(path), {}
     if not path.is_file():
         raise RallError(f"{path}: missing")
-    for number, line in enumerate(path.read_text(encoding="utf-8").splitlines()[1:], start=2):
+    lines = read_text(path, RallError).splitlines()
+    if [word.strip() for word in lines[:1]] != ["timestamp_us,x_m,y_m,yaw_rad"]:
+        raise RallError(f"{path}: columns are {','.join(lines[:1])!r}, expected timestamp_us,x_m,y_m,yaw_rad")
+    for number, line in enumerate(lines[1:], start=2):
         words = line.split(",")
         try:
             poses[int(words[0])] = np.array([float(word) for word in words[1:4]])
@@ -299,7 +307,7 @@ def _load_rows(path: Path | str) -> np.ndarray:
     if not path.is_file():
         raise RallError(f"{path}: missing")
     try:
-        rows = np.loadtxt(path, ndmin=2)
+        rows = np.loadtxt(read_text(path).splitlines(), ndmin=2)
     except ValueError as error:
         raise RallError(f"{path}: not a table of numbers: {error}") from error
     if rows.ndim != 2 or rows.shape[1:] != (3,) or len(rows) == 0:

@@ -7,10 +7,10 @@ interpolated twice, no corner is lost. Images as in the bird's-eye room.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
+from io import BytesIO
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
@@ -283,6 +283,8 @@ def gather_clouds(
     clouds : LidarClouds
         In the order of the jobs.
     """
+    from .files import write_bytes
+
     path, about = Path(path), repr((sorted(settings.items()), [sorted(job.items()) for job in jobs]))
     if path.is_file():
         with np.load(path) as file:
@@ -295,10 +297,9 @@ def gather_clouds(
             if len(parts) % 500 == 0:
                 report(f"{session.name}: lidar points of {len(parts)} of {len(jobs)} scans")
     clouds = LidarClouds(np.concatenate(parts), np.cumsum([0, *map(len, parts)]))
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.stem}.{os.getpid()}.tmp.npz")
-    np.savez_compressed(temporary, points=clouds.points, starts=clouds.starts, about=about)
-    os.replace(temporary, path)
+    content = BytesIO()
+    np.savez_compressed(content, points=clouds.points, starts=clouds.starts, about=about)
+    write_bytes(path, content.getvalue())
     return clouds
 
 

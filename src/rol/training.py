@@ -6,7 +6,6 @@ the step. A run that was stopped therefore ends with the same losses as one that
 
 from __future__ import annotations
 
-import os
 import zlib
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
@@ -225,6 +224,7 @@ def train(
     -----
     Yin et al. 2020, Sec. III-A and IV-A.
     """
+    from .files import write_text
     from .pix2pix import evaluate_l1, save_weights
 
     _check_run(dataset, config)
@@ -257,9 +257,7 @@ def train(
             state.save(checkpoint, about)
             saved_s = monotonic()
     history = pd.DataFrame(state.history, columns=HISTORY_COLUMNS)
-    temporary = folder / f".history.csv.{os.getpid()}.tmp"
-    history.to_csv(temporary, index=False)
-    os.replace(temporary, folder / "history.csv")
+    write_text(folder / "history.csv", history.to_csv(index=False))
     save_weights(
         folder / "generator.safetensors", generator, {**(metadata or {}), **about, "step": state.step}
     )

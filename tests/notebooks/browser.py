@@ -18,7 +18,7 @@ from concurrent.futures import Future
 from dataclasses import dataclass
 from pathlib import Path
 
-CHECKS = Path(__file__).with_name("page.js").read_text()
+CHECKS = Path(__file__).with_name("page.js").read_text(encoding="utf-8")
 LOCAL = ("file:", "data:", "blob:", "about:")
 NAMES = ("chromium", "chromium-browser", "google-chrome")
 LIMIT_S = 120.0  # for one answer of the browser, and for one page to load
@@ -146,7 +146,7 @@ class Browser:
             future.set_exception(BrowserError(f"the browser has ended: {self._last_words()}"))
 
     def _last_words(self) -> str:
-        return Path(self._said.name).read_text(errors="replace")[-2000:]
+        return Path(self._said.name).read_text(encoding="utf-8", errors="replace")[-2000:]
 
     def call(self, method: str, session: str | None = None, **params: object) -> dict:
         """Send one command and give its result."""

@@ -15,7 +15,7 @@ OF_THE_BUILDER = {"genindex.html", "search.html"}
 
 @cache
 def read_page(path: Path) -> BeautifulSoup:
-    return BeautifulSoup(path.read_text(), "html.parser")
+    return BeautifulSoup(path.read_text(encoding="utf-8"), "html.parser")
 
 
 @pytest.fixture

@@ -167,7 +167,7 @@ def test_first_file_leads_to_the_first_page(html: Path, chromium: Browser) -> No
 
 def test_print_is_black_on_white_and_has_no_controls(html: Path, chromium: Browser) -> None:
     tab = chromium.tab()
-    page = next(page for page in pages_of(html) if "<canvas" in page.read_text())
+    page = next(page for page in pages_of(html) if "<canvas" in page.read_text(encoding="utf-8"))
     tab.open(page.as_uri(), View(800, dark=True, medium="print"))
     assert tab.run("document.documentElement.dataset.theme") == "dark"
     assert tab.run("getComputedStyle(document.querySelector('article p')).color") == "rgb(0, 0, 0)"
@@ -245,7 +245,7 @@ BAD = [
 
 def small_page(folder: Path, article: str = "", page: str = GOOD) -> str:
     (folder / "dot.png").write_bytes(DOT)
-    (folder / "page.html").write_text(page.replace("</article>", f"{article}</article>"))
+    (folder / "page.html").write_text(page.replace("</article>", f"{article}</article>"), encoding="utf-8")
     return (folder / "page.html").as_uri()
 
 
@@ -302,7 +302,7 @@ def test_page_that_is_not_there_is_an_error(tmp_path: Path, chromium: Browser) -
 
 def test_browser_that_does_not_start_says_so(tmp_path: Path) -> None:
     program = tmp_path / "broken"
-    program.write_text("#!/bin/sh\necho no display today\n")
+    program.write_text("#!/bin/sh\necho no display today\n", encoding="utf-8")
     program.chmod(0o755)
     with pytest.raises(BrowserError, match="no display today"):
         Browser(str(program), tmp_path)
@@ -310,7 +310,7 @@ def test_browser_that_does_not_start_says_so(tmp_path: Path) -> None:
 
 def test_browser_is_found_by_the_environment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     program = tmp_path / "google-chrome"
-    program.write_text("#!/bin/sh\n")
+    program.write_text("#!/bin/sh\n", encoding="utf-8")
     program.chmod(0o755)
     monkeypatch.setenv("PATH", str(tmp_path))
     monkeypatch.delenv("ROL_CHROMIUM", raising=False)

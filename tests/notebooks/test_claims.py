@@ -68,7 +68,7 @@ class Claim:
 
 
 def read_ledger() -> str:
-    return (BOOK / "claims.md").read_text()
+    return (BOOK / "claims.md").read_text(encoding="utf-8")
 
 
 def read_claims() -> list[Claim]:
@@ -167,7 +167,7 @@ def test_the_counts_on_top_agree_with_the_blocks() -> None:
 
 def test_every_choice_is_told_whole() -> None:
     """What was chosen, and for the paper's own open points also how much it matters, or that nobody knows."""
-    page = (BOOK / "choices.md").read_text()
+    page = (BOOK / "choices.md").read_text(encoding="utf-8")
     items = re.findall(r"^([^\s:#].+)\n((?:: .+\n?)+)", page, re.MULTILINE)
     assert len(items) > 40
     for term, told in items:

@@ -38,11 +38,15 @@ def test_every_localization_run_wrote_its_files(profile: dict) -> None:
 
 
 def check_localization(folder: Path, session: str, method: str) -> dict:
-    metrics = json.loads((folder / "metrics.json").read_text())
+    metrics = json.loads((folder / "metrics.json").read_text(encoding="utf-8"))
     assert METRICS <= set(metrics)
     assert (metrics["session"], metrics["method"]) == (session, method)
     for name in ("trajectory.tum", "truth.tum"):
-        rows = [line for line in (folder / name).read_text().splitlines() if not line.startswith("#")]
+        rows = [
+            line
+            for line in (folder / name).read_text(encoding="utf-8").splitlines()
+            if not line.startswith("#")
+        ]
         assert len(rows) == metrics["n_scans"] and all(len(row.split()) == 8 for row in rows), name
     return metrics
 

@@ -197,9 +197,11 @@ def load_settings(path: Path | str) -> VirtualSettings:
     """
     import yaml
 
+    from ..files import read_text
+
     try:
-        content = yaml.safe_load(Path(path).read_text(encoding="utf-8"))
-    except (OSError, yaml.YAMLError) as error:
+        content = yaml.safe_load(read_text(path))
+    except (OSError, ValueError, yaml.YAMLError) as error:
         raise SettingsError(f"{path}: cannot be read: {error}") from error
     if not isinstance(content, Mapping) or "virtual" not in content:
         raise SettingsError(f"{path}: no section 'virtual'")
@@ -224,9 +226,11 @@ def read_settings(path: Path | str) -> VirtualSettings:
     SettingsError
         If the file cannot be read or a setting is at fault.
     """
+    from ..files import read_text
+
     path = Path(path)
     try:
-        values = json.loads(path.read_text(encoding="utf-8"))
+        values = json.loads(read_text(path))
         shared = {key: value for key, value in values.items() if key not in ("format", "session")}
         section = {**shared, "sessions": {path.absolute().parent.name: values["session"]}}
     except (OSError, ValueError, AttributeError, KeyError) as error:

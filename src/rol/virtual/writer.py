@@ -10,7 +10,6 @@ from __future__ import annotations
 import errno
 import json
 import multiprocessing
-import os
 import shutil
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
@@ -186,25 +185,22 @@ def _write_stretch(folder: Path, session: VirtualSession, first: int, end: int) 
 
 def _prepare_folder(folder: Path, wanted: dict[str, Any], report: Callable[[str], None]) -> bool:
     """Make the folder fit for these settings; False if the session in it is complete."""
+    from ..files import is_used, read_marker
+
     path, wanted = folder / "settings.json", json.loads(json.dumps(wanted))
+    found = read_marker(path)
+    if not {"format", "session"} <= found.keys() and is_used(folder):
+        raise ValueError(
+            f"{folder}: not empty and without a settings.json of this program, so it was not made by it; left alone"
+        )
     for leftover in folder.rglob(".*.tmp"):  # of a run that was killed
         leftover.unlink()
-    found = None
-    if path.exists():
-        try:
-            found = json.loads(path.read_text(encoding="utf-8"))
-        except ValueError:
-            found = {}
-    elif folder.exists() and any(folder.iterdir()):
-        raise ValueError(
-            f"{folder}: not empty and without a settings.json, so it was not made by this program; left alone"
-        )
     if found == wanted and (folder / "session.json").exists():
         report(f"{folder.name}: complete already")
         return False
     if found == wanted:
         report(f"{folder.name}: going on with what is there")
-    elif found is not None:
+    elif found:
         changed = sorted(key for key in {*found, *wanted} if found.get(key) != wanted.get(key))
         report(f"{folder.name}: settings changed ({', '.join(changed)}), starting anew")
         for entry in (folder / name for name in _MADE):
@@ -299,20 +295,14 @@ def _summarise(session: VirtualSession, truth: np.ndarray) -> dict[str, Any]:
 
 
 def _write_json(path: Path, values: dict[str, Any]) -> None:
-    _write_bytes(path, (json.dumps(values, indent=2) + "\n").encode())
+    from ..files import write_text
+
+    write_text(path, json.dumps(values, indent=2) + "\n")
 
 
 def _write_image(path: Path, image: np.ndarray) -> None:
     import cv2
 
-    _write_bytes(path, cv2.imencode(".png", image)[1].tobytes())
+    from ..files import write_bytes
 
-
-def _write_bytes(path: Path, data: bytes) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
-        temporary.write_bytes(data)
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
+    write_bytes(path, cv2.imencode(".png", image)[1].tobytes())

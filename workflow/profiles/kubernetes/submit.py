@@ -79,7 +79,7 @@ def main() -> None:
     """Create the Job and print its name."""
     job = json.dumps(manifest(read_arguments(), Path.cwd()))
     command = ["kubectl", "create", "--filename", "-", "--output", "jsonpath={.metadata.name}"]
-    print(subprocess.run(command, input=job, text=True, check=True, stdout=subprocess.PIPE).stdout)
+    print(subprocess.run(command, input=job, encoding="utf-8", check=True, stdout=subprocess.PIPE).stdout)
 
 
 if __name__ == "__main__":
