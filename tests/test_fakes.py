@@ -94,7 +94,7 @@ def weights(tmp_path: Path, generator: torch.nn.Module) -> Path:
 def session(pairs: Path) -> Path:
     """The same pairs, complete."""
     about = {"settings": {"motion": "none"}, "stamps_us": STAMPS}
-    (pairs / "pairs.json").write_text(json.dumps(about))
+    (pairs / "pairs.json").write_text(json.dumps(about), encoding="utf-8")
     return pairs
 
 
@@ -126,7 +126,7 @@ def test_stopped_session_goes_on_and_other_pairs_start_anew(
     list(fakes.translate_session(weights, session, folder, threshold=120))
     assert made == [[stamp] for stamp in STAMPS] and list_fakes(folder)[1]["threshold"] == 120
     about = {"settings": {"motion": "corrected"}, "stamps_us": STAMPS}
-    (session / "pairs.json").write_text(json.dumps(about))
+    (session / "pairs.json").write_text(json.dumps(about), encoding="utf-8")
     list(fakes.translate_session(weights, session, folder))
     assert made == [[stamp] for stamp in STAMPS] * 2
 
@@ -153,7 +153,7 @@ def test_points_are_moved_to_mid_scan_once(session: Path, weights: Path, tmp_pat
     assert np.abs(moved[1] - recorded[1]).max() > 0.1
     about = json.loads((folder / "fake.json").read_text(encoding="utf-8"))
     about["settings"]["pairs"]["motion"] = "corrected"  # the images are of mid-scan already
-    (folder / "fake.json").write_text(json.dumps(about))
+    (folder / "fake.json").write_text(json.dumps(about), encoding="utf-8")
     np.testing.assert_array_equal(list(fakes.read_points(folder, STAMPS, twists))[1], recorded[1])
 
 

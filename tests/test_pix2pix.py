@@ -201,6 +201,14 @@ def test_step_in_bfloat16_keeps_weights_in_full_precision() -> None:
     assert all(weight.dtype == torch.float32 for weight in networks[0].parameters())
 
 
+def test_padding_keeps_bfloat16() -> None:
+    image = torch.rand(1, 4, 16, 16, generator=torch.Generator().manual_seed(1)).bfloat16()
+    with torch.autocast("cpu", torch.bfloat16):
+        kinds = [pad(image).dtype for pad in pix2pix.build_generator(4, 1, rng=torch.Generator()).modules()
+                 if isinstance(pad, torch.nn.ReflectionPad2d)]  # fmt: skip
+    assert kinds == [torch.bfloat16] * 4
+
+
 def test_steps_of_a_run_count_epochs_unless_told() -> None:
     assert TrainConfig(epochs=3, batch=4).n_steps(10) == 9
     assert TrainConfig(epochs=3, steps=7).n_steps(10) == 7

@@ -338,7 +338,7 @@ def test_generated_images_take_the_network_and_options_of_chapter_05() -> None:
 def test_network_of_chapter_04_is_trained_before_its_images_are_generated(workplace: Path) -> None:
     config = chapters.load_config(ROOT / "config/smoke.yaml")
     config["notebooks"]["05_real_vs_fake"] |= {"network": "chapter 04"}
-    (workplace / "own.yaml").write_text(yaml.safe_dump(config))
+    (workplace / "own.yaml").write_text(yaml.safe_dump(config), encoding="utf-8")
     made = "build/smoke/fake/virtual-town-seq01/fake.json"
     answer = snakemake(workplace, "-n", "--quiet", "rules", "--configfile", "own.yaml", "--", made)
     assert answer.returncode == 0, answer.stderr
