@@ -69,6 +69,21 @@ def test_adapting_draws_the_wall_and_leaves_the_first_network_alone(generator: t
     np.testing.assert_array_equal(generate(again, radar), generate(adapted, radar))
 
 
+def test_adapting_in_bf16_rounds_a_little(generator: torch.nn.Module) -> None:
+    options = {"reach_m": 25.0, "steps": 1, "batch": 2, "settings": SETTINGS}
+    pairs = [make_pair(seed) for seed in range(2)]
+    plain, rounded = (
+        torch.cat(
+            [
+                w.flatten()
+                for w in adapt(generator, pairs, np.random.default_rng(1), bf16=bf16, **options).parameters()
+            ]
+        )
+        for bf16 in (False, True)
+    )
+    assert 0.0 < (plain - rounded).abs().max() < 1e-3
+
+
 def test_nothing_to_learn_from_is_refused(generator: torch.nn.Module) -> None:
     with pytest.raises(ValueError, match="no real pairs"):
         adapt(generator, [], np.random.default_rng(1), reach_m=20.0)

@@ -137,7 +137,7 @@ def test_bf16_is_used_where_the_device_has_it(
     used = []
     monkeypatch.setattr(fakes, "write_fakes", lambda *words, bf16: used.append(bf16) or [words[3][0]])
     monkeypatch.setattr(fakes, "finish_fakes", lambda *words: None)
-    for has, wanted in ((True, True), (True, False), (False, True)):
+    for has, wanted in ((True, "auto"), (True, False), (False, "auto")):
         monkeypatch.setattr(pix2pix, "has_bf16", lambda device, has=has: has)
         list(fakes.translate_session(weights, session, tmp_path / "fake", bf16=wanted))
     assert used == [True] * 3 + [False] * 6

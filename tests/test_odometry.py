@@ -4,9 +4,10 @@ import re
 
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 
 from rol.evaluation import pose_errors, rmse
-from rol.geometry import accumulate_steps, invert, relative_pose, transform_points
+from rol.geometry import accumulate_steps, compose, invert, relative_pose, transform_points
 from rol.odometry import (
     LocalMapSettings,
     OdometryError,
@@ -19,6 +20,7 @@ from rol.odometry import (
     local_map_odometry,
     register_robust,
     search_motion,
+    sort_cloud,
     steps_of,
 )
 from rol.radar import DOPPLER_SECONDS, SCAN_SECONDS, peaks_to_points
@@ -50,6 +52,67 @@ def test_fit_rigid_agrees_with_the_svd():
         source, pose = rng.normal(0.0, 10.0, (30, 2)), rng.uniform(-3.0, 3.0, 3)
         target = transform_points(pose, source) + rng.normal(0.0, 0.5, source.shape)
         np.testing.assert_allclose(fit_rigid(source, target), svd_fit(source, target), atol=1e-9)
+
+
+def test_fit_rigid_refuses_clouds_of_unequal_length():
+    with pytest.raises(OdometryError, match="3 source points cannot be paired with 2 target points"):
+        fit_rigid(np.eye(3)[:, :2], np.eye(2))
+
+
+def icp_by_tree(source, target, pose, limit=3.0, least=1.0, trim=0.9):
+    """ICP as in `icp_2d`, with a k-d tree and NumPy, the oracle: pose, pairs, fits, and whether it converged."""
+    tree, pose = cKDTree(target), np.array(pose)
+    for iteration in range(1, 31):
+        moved = transform_points(pose, source)
+        distances, neighbours = tree.query(moved, distance_upper_bound=limit)
+        kept = np.argsort(distances)[: int(np.ceil(trim * np.isfinite(distances).sum()))]
+        change = fit_rigid(moved[kept], target[neighbours[kept]])
+        last, pose = pose, compose(change, pose)
+        if limit <= least and np.hypot(*(pose - last)[:2]) + 30.0 * abs(change[2]) < 1e-3:
+            return pose, len(kept), iteration, True
+        limit = max(0.8 * limit, least)
+    return pose, len(kept), 30, False
+
+
+@pytest.mark.parametrize("limits", [(3.0, 1.0), (25.0, 2.0), (0.7, 0.7), (np.inf, np.inf)])
+@pytest.mark.parametrize("n", [25, 1000])
+def test_icp_agrees_with_a_search_by_tree(limits, n):
+    rng = np.random.default_rng(n)
+    stray = [(1e6, -3e6), (-1e15, 0.0), (1e200, 1e200)]
+    target = np.concatenate([rng.uniform(-40.0, 40.0, (2 * n, 2)), stray])
+    source = transform_points(invert((0.4, -0.2, 0.02)), target[:n])
+    source = np.concatenate([source + rng.normal(0.0, 0.05, source.shape), rng.uniform(-90, 90, (n // 2, 2))])
+    found = icp_2d(
+        source, target, (0.1, 0.05, 0.01), max_distance=limits[0], min_distance=limits[1], max_points=9999
+    )
+    pose, *rest = icp_by_tree(source, target, (0.1, 0.05, 0.01), *limits)
+    np.testing.assert_allclose(found.T_target_source, pose, rtol=0.0, atol=1e-12)
+    assert [found.n_matched, found.iterations, found.converged] == rest
+
+
+def test_stray_points_need_no_memory():
+    cloud = np.concatenate([posts(), [[1e6, 1e6], [-1e12, 5.0]]])
+    assert len(sort_cloud(cloud).starts) == len(sort_cloud(posts()).starts) < 10 * len(cloud)
+    np.testing.assert_array_equal(np.unique(sort_cloud(cloud).points, axis=0), np.unique(cloud, axis=0))
+
+
+def wall(length_m: float = 60.0, noise_m: float = 0.1, seed: int = 0) -> np.ndarray:
+    """One straight wall across the axes, shape (n, 2) [m]."""
+    along = np.arange(-length_m / 2.0, length_m / 2.0, 0.25)
+    noise = np.random.default_rng(seed).normal(0.0, noise_m, len(along))
+    return transform_points((3.0, 5.0, 0.6), np.column_stack([along, noise]))
+
+
+def test_icp_tells_that_a_wall_leaves_one_direction_open():
+    along = transform_points((0.0, 0.0, 0.6), np.array([[2.0, 0.0]]))[0]  # 2 m along the wall
+    one = icp_2d(wall()[40:-40] + along, wall(seed=1))
+    assert one.converged and one.weakest_direction < 0.05
+    corner = [np.concatenate([w, transform_points((0.0, 0.0, np.pi / 2), w)]) for w in (wall(), wall(seed=1))]
+    both = icp_2d(corner[0] + 0.1, corner[1])
+    assert both.converged and both.weakest_direction > 0.8
+    most = [np.concatenate([wall(seed=seed), posts(80)]) for seed in (0, 1)]  # 240 points of a wall, 80 posts
+    assert one.weakest_direction < icp_2d(most[0] + 0.1, most[1]).weakest_direction < both.weakest_direction
+    assert np.isnan(icp_2d(wall(), wall() + 500.0).weakest_direction)
 
 
 @pytest.mark.parametrize("motion", [(0.0, 0.0, 0.0), (0.8, -0.2, 0.05), (-1.5, 0.6, -0.08)])
@@ -180,6 +243,19 @@ def test_search_without_points_gives_the_guess_and_refuses_bad_ones() -> None:
         search_motion(np.full((4, 2), np.nan), cloud)
 
 
+def test_search_ignores_stray_points_and_refuses_what_fits_no_grid() -> None:
+    world = thick_street(np.random.default_rng(0))
+    source, target = seen_from((1.3, -0.2, 0.03), world), seen_from((0.0, 0.0, 0.0), world)
+    stray = np.concatenate([target, [[1e6, 1e6], [-1e6, 0.0]]])
+    np.testing.assert_array_equal(search_motion(source, stray), search_motion(source, target))
+    with pytest.raises(
+        OdometryError, match=r"source and target cloud: .* 2000000 m x 10000\d\d m, too far .*stray"
+    ):
+        search_motion(np.concatenate([source, [[1e6, 1e6]]]), stray)
+    far = target + 5000.0  # nothing to fall on
+    np.testing.assert_array_equal(search_motion(source, far, (0.1, 0.0, 0.0)), (0.1, 0.0, 0.0))
+
+
 # ---- registration to a local map ----
 
 
@@ -212,9 +288,9 @@ def test_correct_cloud_does_what_the_radar_room_does_to_peaks():
 def test_local_map_keeps_the_mean_of_cells_that_were_seen_twice():
     settings = LocalMapSettings(cell_m=1.0, min_views=2)
     clouds = [np.array([[0.0, 0.0], [0.2, 0.4], [5.0, 0.0]]), np.array([[0.4, 0.2]]), np.array([[9.0, 9.0]])]
-    np.testing.assert_allclose(build_local_map(clouds, settings).tree.data, [[0.2, 0.2]])
+    np.testing.assert_allclose(build_local_map(clouds, settings).cloud.points, [[0.2, 0.2]])
     one = build_local_map(clouds[:1], settings)  # of one cloud all is kept
-    np.testing.assert_allclose(one.tree.data, [[0.1, 0.2], [5.0, 0.0]])
+    np.testing.assert_allclose(one.cloud.points, [[0.1, 0.2], [5.0, 0.0]])
     np.testing.assert_allclose(one.metrics, np.tile(np.eye(2), (2, 1, 1)))
     assert build_local_map([], settings) is None and build_local_map([np.zeros((0, 2))] * 3, settings) is None
 
@@ -223,11 +299,35 @@ def test_points_on_a_wall_are_held_across_it_and_let_go_along_it():
     wall = np.column_stack([np.arange(0.0, 10.0, 0.5), 0.5 * np.arange(0.0, 10.0, 0.5)])  # slope one half
     local_map = build_local_map([np.concatenate([wall, [[50.0, 0.0]]])], LocalMapSettings(cell_m=0.25))
     along, across = np.array([2.0, 1.0]) / np.sqrt(5), np.array([-1.0, 2.0]) / np.sqrt(5)
-    for point, metric in zip(local_map.tree.data, local_map.metrics, strict=True):
+    for point, metric in zip(local_map.cloud.points, local_map.metrics, strict=True):
         assert across @ metric @ across == pytest.approx(1.0)
         on_wall = 1.0 < point[0] < 9.0
         if on_wall or point[0] == 50.0:
             assert along @ metric @ along == pytest.approx(0.05 if on_wall else 1.0)
+
+
+def test_lines_are_fitted_to_the_twelve_nearest_points():
+    points = np.random.default_rng(4).uniform(0.0, 6.0, (200, 2)) * (1.0, 0.1)
+    settings = LocalMapSettings(cell_m=1e-3, line_radius_m=0.8, line_ratio=0.3)
+    local_map = build_local_map([points], settings)
+    distances, neighbours = cKDTree(points).query(local_map.cloud.points, 12)
+    n_lines = 0
+    for metric, near, rows in zip(local_map.metrics, distances < 0.8, neighbours, strict=True):
+        (low, high), axes = np.linalg.eigh(np.cov(points[rows[near]].T, bias=True))
+        is_line = near.sum() >= 5 and low < 0.3 * high
+        n_lines += is_line
+        np.testing.assert_allclose(
+            metric, np.eye(2) - is_line * 0.95 * np.outer(axes[:, 1], axes[:, 1]), atol=1e-9
+        )
+    assert 20 < n_lines < 180
+
+
+def test_robust_registration_tells_that_a_wall_leaves_one_direction_open():
+    settings = LocalMapSettings()
+    found = register_robust(wall()[20:-20], build_local_map([wall(seed=1)], settings), np.zeros(3), settings)
+    assert found.converged and found.weakest_direction < 0.1
+    cross = register_robust(street()[::2], build_local_map([street()], settings), np.zeros(3), settings)
+    assert cross.weakest_direction > 0.3
 
 
 @pytest.mark.parametrize("along_weight", [0.05, 1.0])
@@ -442,6 +542,27 @@ def test_follow_map_holds_the_pose_where_odometry_drifts():
     poses = np.array([result.T_target_source for result in results])
     np.testing.assert_allclose(poses, truth, atol=0.05)
     assert all(result.converged for result in results)
+
+
+def test_follow_map_registers_to_the_near_points_alone():
+    rng, points = (
+        np.random.default_rng(5),
+        np.concatenate([posts(400), posts(400) + (60.0, 0.0), [[1e7, 0.0]]]),
+    )
+    poses = [(float(x), 0.5, 0.01) for x in (0, 9, 40, 107)]
+    clouds = [transform_points(invert(pose), points)[:-1] + rng.normal(0.0, 0.1, (800, 2)) for pose in poses]
+    steps = relative_pose(np.array(poses[:-1]), np.array(poses[1:]))
+    results = list(follow_map(steps, clouds, points, poses[0], reach_m=20.0, max_points=700, min_share=0.05))
+    guess = np.array(poses[0])
+    for step, cloud, found in zip([*steps, np.zeros(3)], clouds, results, strict=True):
+        near = points[np.hypot(*(points - guess[:2]).T) <= 20.0]
+        expected = icp_2d(cloud, near, guess, max_points=700)
+        assert found.converged == expected.converged and found.n_matched == expected.n_matched
+        if found.converged:
+            np.testing.assert_allclose(found.T_target_source, expected.T_target_source, rtol=0.0, atol=1e-12)
+        guess = compose(found.T_target_source, step)
+    assert [found.converged for found in results] == [True, True, True, False]
+    assert 0 < len(near) < 10 and results[-1].n_matched == 0  # too few to register to
 
 
 def test_follow_map_goes_on_by_the_step_without_points_and_begins_again_where_it_is_set():

@@ -18,6 +18,7 @@ from rol.pix2pix import (
     TrainConfig,
     build_discriminator,
     build_generator,
+    choose_bf16,
     entropy_loss,
     evaluate_l1,
     gan_loss,
@@ -202,11 +203,24 @@ def test_step_in_bfloat16_keeps_weights_in_full_precision() -> None:
 
 
 def test_padding_keeps_bfloat16() -> None:
-    image = torch.rand(1, 4, 16, 16, generator=torch.Generator().manual_seed(1)).bfloat16()
+    image = torch.rand(1, 4, 16, 16, generator=seeded(1)).bfloat16()
+    pads = [
+        part
+        for part in build_generator(4, 1, rng=seeded(2)).modules()
+        if isinstance(part, nn.ReflectionPad2d)
+    ]
     with torch.autocast("cpu", torch.bfloat16):
-        kinds = [pad(image).dtype for pad in pix2pix.build_generator(4, 1, rng=torch.Generator()).modules()
-                 if isinstance(pad, torch.nn.ReflectionPad2d)]  # fmt: skip
+        kinds = [pad(image).dtype for pad in pads]
     assert kinds == [torch.bfloat16] * 4
+
+
+def test_bf16_is_chosen_by_the_processor_unless_it_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    for there in (False, True):
+        monkeypatch.setattr("rol.pix2pix.has_bf16", lambda device, there=there: there)
+        assert [choose_bf16(value) for value in (False, True, "auto")] == [False, True, there]
+    for value in ("yes", 1, None):
+        with pytest.raises(Pix2PixError, match='bf16: expected true, false or "auto"'):
+            choose_bf16(value)
 
 
 def test_steps_of_a_run_count_epochs_unless_told() -> None:

@@ -88,6 +88,11 @@ def test_classifier_tells_what_differs_and_nothing_else() -> None:
     assert abs(alike.auc - 0.5) < 0.06 and alike.scores.shape == (2, 2, 25, 58)
     other = telling.tell_apart(one, louder, rng, folds=2, epochs=2)
     assert other.auc > 0.9 and len(other.fold_aucs) == 2
+    rounded = telling.tell_apart(one, louder, rng, folds=2, epochs=2, bf16=True)
+    assert abs(rounded.auc - other.auc) < 0.02
+    assert not (
+        rounded.scores.astype(np.float32).view(np.uint32) & 0xFFFF
+    ).any()  # the bits that bf16 leaves out
     found = telling.give_aways(other, one, louder)
     assert found["range"]["110-170"] > 0.9
     with pytest.raises(ValueError, match="cannot be split"):

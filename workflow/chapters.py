@@ -216,8 +216,8 @@ def translation(config: dict, notebooks: Path = NOTEBOOKS) -> dict[str, str]:
     weights = Path(known["weights_root"], f"{known['network']}.safetensors")
     if known["network"] == "chapter 04":
         weights = Path(config["out_dir"], "pix2pix", "generator.safetensors")
-    options = ["--threshold", str(known["threshold"]), "--device", known["device"]]
-    return {"weights": str(weights), "options": shlex.join(options + ["--bf16"] * bool(known["bf16"]))}
+    options = [f"--{name}={str(known[name]).lower()}" for name in ("threshold", "device", "bf16")]
+    return {"weights": str(weights), "options": shlex.join(options)}
 
 
 def papermill_arguments(parameters: dict) -> str:

@@ -14,6 +14,8 @@ import torch
 
 from rol.fakes import translate_session
 
+BF16 = {"auto": "auto", "true": True, "false": False}
+
 
 def read_arguments(words: list[str] | None = None) -> argparse.Namespace:
     """Read the command line."""
@@ -25,7 +27,9 @@ def read_arguments(words: list[str] | None = None) -> argparse.Namespace:
         "--threshold", type=int, default=0, help="grey value of a point; 0: that of the network"
     )
     parser.add_argument("--device", default="cpu", help="cpu or cuda")
-    parser.add_argument("--bf16", action="store_true", help="multiply in bfloat16 where the device can")
+    parser.add_argument(
+        "--bf16", choices=BF16, default="auto", help="multiply in bfloat16; auto: where the device can"
+    )
     parser.add_argument("--threads", type=int, default=1, help="threads of the processor; 1 if not given")
     return parser.parse_args(words)
 
@@ -34,7 +38,7 @@ def main(words: list[str] | None = None) -> int:
     """Generate the images; return 0, or 1 after a fault, which is printed on stderr."""
     given = read_arguments(words)
     torch.set_num_threads(given.threads)
-    options = {"threshold": given.threshold, "device": given.device, "bf16": given.bf16}
+    options = {"threshold": given.threshold, "device": given.device, "bf16": BF16[given.bf16]}
     try:
         n_images = sum(1 for _ in translate_session(given.weights, given.pairs, given.out, **options))
     except (ValueError, OSError) as error:

@@ -57,7 +57,7 @@ def translate_session(
     *,
     threshold: int = 0,
     device: str = "cpu",
-    bf16: bool = True,
+    bf16: bool | str = "auto",
 ) -> Iterator[int]:
     """Generate the lidar images of a session that are missing; a complete folder is not touched.
 
@@ -73,8 +73,8 @@ def translate_session(
         Smallest grey value that counts as a point, 1 to 255; 0 for the one that comes with the weights.
     device : str
         Where the network runs, "cpu" or "cuda".
-    bf16 : bool
-        Multiply in bfloat16 where the device has the instructions.
+    bf16 : bool or "auto"
+        Whether to multiply in bfloat16, see `rol.pix2pix.choose_bf16`.
 
     Yields
     ------
@@ -88,7 +88,7 @@ def translate_session(
     """
     from .front_ends import load_translator
     from .pairs import list_pairs
-    from .pix2pix import has_bf16
+    from .pix2pix import choose_bf16
 
     stamps_us = list_pairs(pairs)
     described = json.loads((Path(pairs) / "pairs.json").read_text(encoding="utf-8"))["settings"]
@@ -100,10 +100,10 @@ def translate_session(
     if whole.is_file() and whole.read_text(encoding="utf-8") == _describe_fakes(settings, stamps_us, points):
         yield from stamps_us
         return
-    there, bf16 = prepare_fakes(folder, settings), bf16 and has_bf16(device)
+    there, fast = prepare_fakes(folder, settings), choose_bf16(bf16, device)
     generator = translator.generator.to(device)
     for stamp in stamps_us:
-        yield from [stamp] if stamp in there else write_fakes(generator, pairs, folder, [stamp], bf16=bf16)
+        yield from [stamp] if stamp in there else write_fakes(generator, pairs, folder, [stamp], bf16=fast)
     finish_fakes(folder, settings, stamps_us, points)
 
 

@@ -11,9 +11,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
-from scipy.spatial import cKDTree
+from numba import njit
 
 try:
     from .geometry import check_poses, compose, relative_pose, transform_points, wrap_angle
@@ -23,6 +24,7 @@ except ImportError:  # this file was copied on its own
 
 _FIRST_REACH = (6.0, 0.8, np.deg2rad(4.0))  # of a search for the first motion [m, m, rad]
 _REACH = (2.0, 0.8, np.deg2rad(8.0))  # of one for a later motion, up to half a second long
+_MAX_CELLS = 10**8  # of a search: 400 MB
 
 
 class OdometryError(ValueError):
@@ -45,6 +47,11 @@ class IcpResult:
         Fits made.
     converged : bool
         True when the last fits moved less than the tolerance; False also for clouds too small to be matched.
+    weakest_direction : float
+        How well the last pairs constrain the translation in its worst direction, relative to its best one: near 0
+        along one straight wall, where the pose may slide although it converged, 1 where all directions are equal.
+        A pair on a line counts across the line only; the line is fitted to the target points within 2 m. NaN
+        without a fit.
     """
 
     T_target_source: np.ndarray
@@ -52,6 +59,25 @@ class IcpResult:
     rmse_m: float
     iterations: int
     converged: bool
+    weakest_direction: float = float("nan")
+
+
+class SortedCloud(NamedTuple):
+    """A target cloud whose points are sorted by cells of 1 m, for many registrations; from `sort_cloud`.
+
+    Attributes
+    ----------
+    points : array, shape (n, 2)
+        The points, those of a cell one after the other [m].
+    starts : array of int, shape (k,)
+        Where the points of each cell start, and their number at the end.
+    around : tuple of float
+        Points outside this circle do not count: x and y of its centre [m], its squared radius [m2].
+    """
+
+    points: np.ndarray
+    starts: np.ndarray
+    around: tuple[float, float, float] = (0.0, 0.0, np.inf)
 
 
 def check_cloud(points: np.ndarray, name: str) -> np.ndarray:
@@ -95,17 +121,44 @@ def fit_rigid(source: np.ndarray, target: np.ndarray) -> np.ndarray:
     T_target_source : array, shape (3,)
         The minimizer of the sum of squared distances [m, m, rad]. In the plane the SVD solution of Arun et
         al. has this closed form: the heading is the angle of (sum of dot products, sum of cross products).
+
+    Raises
+    ------
+    OdometryError
+        If a cloud is none, or has more points than the other.
     """
-    source_mean, target_mean = source.mean(axis=0), target.mean(axis=0)
-    a, b = source - source_mean, target - target_mean
-    yaw = np.arctan2(np.sum(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]), np.sum(a * b))
-    x, y = target_mean - transform_points((0.0, 0.0, yaw), source_mean[None])[0]
-    return np.array([x, y, yaw])
+    source, target = check_cloud(source, "source"), check_cloud(target, "target")
+    if len(source) != len(target):
+        raise OdometryError(f"{len(source)} source points cannot be paired with {len(target)} target points")
+    rows = np.arange(len(source))
+    return np.array(_fit_rigid(source, target, rows, rows)[0])
+
+
+def sort_cloud(points: np.ndarray, name: str = "target cloud") -> SortedCloud:
+    """Sort a cloud by cells, as `icp_2d` does with its target at each call.
+
+    Parameters
+    ----------
+    points : array, shape (n, 2)
+        Points [m].
+    name : str
+        What the cloud is called in the message.
+
+    Returns
+    -------
+    cloud : SortedCloud
+
+    Raises
+    ------
+    OdometryError
+        If the cloud has another shape or a value that is not finite.
+    """
+    return SortedCloud(*_sort(np.ascontiguousarray(check_cloud(points, name))))
 
 
 def icp_2d(
     source: np.ndarray,
-    target: np.ndarray,
+    target: np.ndarray | SortedCloud,
     init: np.ndarray | tuple[float, float, float] = (0.0, 0.0, 0.0),
     *,
     max_distance: float = 3.0,
@@ -121,7 +174,7 @@ def icp_2d(
     Parameters
     ----------
     source, target : array, shape (n, 2) and (m, 2)
-        Clouds in their own frames [m].
+        Clouds in their own frames [m]; a target that is used again and again may be a `SortedCloud`.
     init : array-like, shape (3,)
         First guess of T_target_source [m, m, rad].
     max_distance, min_distance : float
@@ -150,28 +203,13 @@ def icp_2d(
     OdometryError
         If a cloud has another shape or a value that is not finite. Yin et al. 2020, Sec. III-B, below Eq. 7.
     """
-    source, target = check_cloud(source, "source cloud"), check_cloud(target, "target cloud")
-    pose, limit = check_poses(init, "initial guess").copy(), max_distance
-    if min(len(source), len(target)) < min_matched:
+    source, pose = check_cloud(source, "source cloud"), check_poses(init, "initial guess").copy()
+    target = target if isinstance(target, SortedCloud) else sort_cloud(target)
+    if min(len(source), _count_around(target, min_matched)) < min_matched:
         return IcpResult(pose, 0, float("nan"), 0, False)
-    if len(source) > max_points:
-        source = source[np.linspace(0, len(source) - 1, max_points).astype(int)]
-    tree, n_matched, rmse_m = cKDTree(target), 0, float("nan")
-    for iteration in range(1, max_iterations + 1):
-        moved = transform_points(pose, source)
-        distances, neighbours = tree.query(moved, distance_upper_bound=limit)
-        pairs = _closest(distances, trim)
-        n_matched = len(pairs)
-        if n_matched < min_matched or np.ptp(moved[pairs], axis=0).max() == 0.0:
-            return IcpResult(pose, n_matched, rmse_m, iteration - 1, False)
-        rmse_m = float(np.sqrt(np.mean(distances[pairs] ** 2)))
-        change = fit_rigid(moved[pairs], target[neighbours[pairs]])
-        pose, last = compose(change, pose), pose
-        shift = np.hypot(*(pose - last)[:2]) + 30.0 * abs(change[2])
-        if limit <= min_distance and shift < tolerance:
-            return IcpResult(pose, n_matched, rmse_m, iteration, True)
-        limit = max(0.8 * limit, min_distance)
-    return IcpResult(pose, n_matched, rmse_m, max_iterations, False)
+    limits = float(max_distance), float(min_distance)
+    stops = float(trim), int(max_iterations), float(tolerance), int(min_matched)
+    return IcpResult(*_iterate_icp(_choose(source, max_points), target, pose, limits, stops))
 
 
 def search_motion(
@@ -211,13 +249,17 @@ def search_motion(
     Raises
     ------
     OdometryError
-        If a cloud has another shape or a value that is not finite.
+        If a cloud has another shape or a value that is not finite, or if both reach so far that the cells would fill
+        the memory.
     """
     source, target = check_cloud(source, "source cloud"), check_cloud(target, "target cloud")
     best = check_poses(guess, "initial guess").copy()
     if min(len(source), len(target)) == 0:
         return best
-    source = source[np.linspace(0, len(source) - 1, min(len(source), max_points)).astype(int)]
+    source = _choose(source, max_points)
+    target = _within_reach(source, target, best, reach, cell)
+    if len(target) == 0:
+        return best
     corner = target.min(axis=0) - 3.5 * cell  # points of an image then lie in the middle of cells
     marked = np.zeros(np.ceil((target.max(axis=0) - corner) / cell).astype(int) + 4, dtype=np.int32)
     u, v = np.floor((target - corner) / cell).astype(int).T
@@ -330,20 +372,38 @@ def follow_map(
     OdometryError
         If there are fewer steps than clouds ask for, or a cloud is none.
     """
-    map_points = check_cloud(map_points, "map")
-    tree, pose, steps = cKDTree(map_points), check_poses(start, "start"), iter(steps)
+    target, pose, steps = sort_cloud(map_points, "map"), check_poses(start, "start"), iter(steps)
     for index, cloud in enumerate(clouds):
         step = np.zeros(3) if index == 0 else next(steps, None)
         if step is None:
             raise OdometryError(f"no odometry step to scan {index}: one fewer than clouds are needed")
         guess = compose(pose, step)
-        near = map_points[tree.query_ball_point(guess[:2], reach_m)]
+        near = target._replace(around=(float(guess[0]), float(guess[1]), float(reach_m) ** 2))
         result = icp_2d(cloud, near, guess, max_points=max_points, **settings)
         if not result.converged or result.n_matched < min_share * min(len(cloud), max_points):
             result = replace(result, T_target_source=guess, converged=False)
         yield result
         restart = supervisor(index, result.T_target_source) if supervisor else None
         pose = result.T_target_source if restart is None else check_poses(restart, "restart")
+
+
+def _within_reach(
+    source: np.ndarray,
+    target: np.ndarray,
+    guess: np.ndarray,
+    reach: tuple[float, float, float],
+    cell: float,
+) -> np.ndarray:
+    """Leave out what no point of the source can fall on; refuse what is still too wide for a grid."""
+    longest = np.hypot(*source.T).max() + 1.2 * np.hypot(*reach[:2]) + 4.0 * cell
+    target = target[np.hypot(*(target - guess[:2]).T) <= longest]
+    sides = np.ptp(target, axis=0) if len(target) else np.zeros(2)
+    if np.prod(sides / cell + 8.0) > _MAX_CELLS:
+        raise OdometryError(
+            f"source and target cloud: points reach over {sides[0]:.0f} m x {sides[1]:.0f} m, too far for cells of "
+            f"{cell} m; remove stray points"
+        )
+    return target
 
 
 def _offsets(reach: np.ndarray, step: np.ndarray) -> np.ndarray:
@@ -366,11 +426,203 @@ def _count_marked(
     return marked[u, v].sum(axis=1)
 
 
-def _closest(distances: np.ndarray, share: float) -> np.ndarray:
-    """Give the indices of the smallest finite distances, a share of them."""
-    finite = np.flatnonzero(np.isfinite(distances))
-    n = int(np.ceil(share * len(finite)))
-    return finite if n == len(finite) else finite[np.argpartition(distances[finite], n - 1)[:n]]
+def _choose(points: np.ndarray, n: int) -> np.ndarray:
+    """Choose at most n points, evenly spaced in their order."""
+    return points[np.linspace(0, len(points) - 1, min(len(points), n)).astype(int)]
+
+
+# ---- nearest neighbours in cells of 1 m, compiled ----------------------------------------------------------------
+# The cells of a cloud are numbered as on a torus: cell (i, j) shares its number with (i + width, j), (i, j + width)
+# and so on. Points far away cost no memory, and no point is missed.
+
+
+@njit(cache=True)
+def _to_cell(x):
+    """Number of the 1 m cell along one axis; farther than any cloud reaches, all are the same."""
+    return np.int64(np.floor(min(max(x, -1e15), 1e15)))
+
+
+@njit(cache=True)
+def _sort(points):
+    """Sort points by cell: the sorted points, and where those of each cell start, shape (width^2 + 1,)."""
+    width = 8
+    while width * width < 4 * len(points):
+        width *= 2
+    cells, starts = np.empty(len(points), np.int64), np.zeros(width * width + 1, np.int64)
+    for k in range(len(points)):
+        u, v = _to_cell(points[k, 0]), _to_cell(points[k, 1])
+        cells[k] = (u & (width - 1)) * width + (v & (width - 1))
+        starts[cells[k] + 1] += 1
+    starts = np.cumsum(starts)
+    free, found = starts.copy(), np.empty_like(points)
+    for k in range(len(points)):
+        found[free[cells[k]]] = points[k]
+        free[cells[k]] += 1
+    return found, starts
+
+
+@njit(cache=True)
+def _count_around(target, enough):
+    """Count the points in the circle, no further than enough of them."""
+    points, _, (x, y, limit) = target
+    n = 0
+    for k in range(len(points)):
+        n += (points[k, 0] - x) ** 2 + (points[k, 1] - y) ** 2 <= limit
+        if n >= enough:
+            break
+    return n
+
+
+@njit(cache=True)
+def _find_nearest(x, y, target, limit):
+    """Find the point nearest to (x, y): its index and squared distance, (-1, limit) if none is below this limit.
+
+    Cells of the `SortedCloud` are searched in square rings, until the next ring is too far away or the torus is closed.
+    """
+    points, starts, around = target
+    width = np.int64(np.sqrt(len(starts) - 1))
+    u, v, nearest = _to_cell(x), _to_cell(y), -1
+    margin = min(x - u, u + 1 - x, y - v, v + 1 - y)
+    for ring in range(width // 2 + 1):
+        gap = ring - 1 + margin
+        if gap > 0.0 and gap * gap >= limit:
+            break
+        for i in range(-ring, ring + 1):
+            aside, row = max(u + i - x, x - u - i - 1, 0.0), ((u + i) & (width - 1)) * width
+            for j in range(-ring, ring + 1, 1 if abs(i) == ring else 2 * ring):
+                cell = row + ((v + j) & (width - 1))
+                if starts[cell] == starts[cell + 1]:
+                    continue
+                if aside * aside + max(v + j - y, y - v - j - 1, 0.0) ** 2 >= limit:
+                    continue
+                for k in range(starts[cell], starts[cell + 1]):
+                    square = (points[k, 0] - x) ** 2 + (points[k, 1] - y) ** 2
+                    if square < limit:
+                        away = (points[k, 0] - around[0]) ** 2 + (points[k, 1] - around[1]) ** 2
+                        if away <= around[2]:
+                            nearest, limit = k, square
+    return nearest, limit
+
+
+@njit(cache=True)
+def _pair(pose, source, target, limit):
+    """Move points and pair them: those with a neighbour, its index, and the squared distance."""
+    moved, matched = np.empty_like(source), np.empty(len(source), np.int64)
+    squares, c, s, n = np.empty(len(source)), np.cos(pose[2]), np.sin(pose[2]), 0
+    for k in range(len(source)):
+        x = c * source[k, 0] - s * source[k, 1] + pose[0]
+        y = s * source[k, 0] + c * source[k, 1] + pose[1]
+        matched[n], squares[n] = _find_nearest(x, y, target, limit)
+        moved[n, 0], moved[n, 1] = x, y
+        n += matched[n] >= 0
+    return moved[:n], matched[:n], squares[:n]
+
+
+@njit(cache=True)
+def _find_closest(squares, share):
+    """Indices of the smallest values, a share of them."""
+    n = int(np.ceil(share * len(squares)))
+    if n == len(squares):
+        return np.arange(n)
+    bound = np.partition(squares, n - 1)[n - 1] if n else 0.0
+    below, equal = np.flatnonzero(squares < bound), np.flatnonzero(squares == bound)
+    return np.concatenate((below, equal[: n - len(below)]))
+
+
+@njit(cache=True)
+def _fit_rigid(source, target, rows, matched):
+    """Fit as `fit_rigid` does: row k of the source, of those in ``rows``, belongs to row ``matched[k]`` of the target.
+
+    Returns the motion (x, y, yaw) as a tuple, and whether these points of the source are apart from each other.
+    """
+    x, y, u, v = 0.0, 0.0, 0.0, 0.0
+    for k in rows:
+        x, y = x + source[k, 0], y + source[k, 1]
+        u, v = u + target[matched[k], 0], v + target[matched[k], 1]
+    n = max(len(rows), 1)
+    x, y, u, v = x / n, y / n, u / n, v / n
+    dots, crosses, is_fixed = 0.0, 0.0, False
+    for k in rows:
+        a, b, p, q = source[k, 0] - x, source[k, 1] - y, target[matched[k], 0] - u, target[matched[k], 1] - v
+        dots += a * p + b * q
+        crosses += a * q - b * p
+        is_fixed |= source[k, 0] != source[rows[0], 0] or source[k, 1] != source[rows[0], 1]
+    yaw = np.arctan2(crosses, dots)
+    c, s = np.cos(yaw), np.sin(yaw)
+    return (u - c * x + s * y, v - s * x - c * y, yaw), is_fixed
+
+
+@njit(cache=True)
+def _iterate_icp(source, target, pose, limits, stops):
+    """Pair and fit in turns: what `IcpResult` holds, in its order."""
+    limit, (trim, max_iterations, tolerance, min_matched) = limits[0], stops
+    n_matched, rmse_m = 0, np.nan
+    for iteration in range(1, max_iterations + 1):
+        moved, matched, squares = _pair(pose, source, target, limit * limit)
+        kept = _find_closest(squares, trim)
+        (x, y, yaw), is_fixed = _fit_rigid(moved, target.points, kept, matched)
+        n_matched = len(kept)
+        if n_matched < min_matched or not is_fixed:
+            return pose, n_matched, rmse_m, iteration - 1, False, np.nan
+        rmse_m = np.sqrt(np.mean(squares[kept]))
+        c, s, last = np.cos(yaw), np.sin(yaw), pose
+        heading = (yaw + last[2] + np.pi) % (2.0 * np.pi) - np.pi
+        pose = np.array([x + c * last[0] - s * last[1], y + s * last[0] + c * last[1], heading])
+        shift = np.hypot(pose[0] - last[0], pose[1] - last[1]) + 30.0 * abs(yaw)
+        is_done = limit <= limits[1] and shift < tolerance
+        if is_done or iteration == max_iterations:
+            return pose, n_matched, rmse_m, iteration, is_done, _weigh_directions(target, matched[kept])
+        limit = max(0.8 * limit, limits[1])
+    return pose, 0, np.nan, 0, False, np.nan  # no iterations were allowed
+
+
+@njit(cache=True)
+def _weigh_directions(target, matched):
+    """See `IcpResult.weakest_direction`; from at most 100 of the matched points."""
+    total, even, slanted = 0.0, 0.0, 0.0  # xx + yy, xx - yy and 2 xy of the sum of the weights
+    for m in range(0, len(matched), len(matched) // 100 + 1):
+        n, xx, yy, xy = _spread_about(target, target.points[matched[m]], 2.0, len(target.points))
+        largest = xx + yy + np.hypot(xx - yy, 2.0 * xy)  # twice the variance along the line
+        if n < 3 or largest == 0.0:
+            total += 1.0
+        else:
+            total += (xx + yy) / largest
+            even -= (xx - yy) / largest
+            slanted -= 2.0 * xy / largest
+    unequal = np.hypot(even, slanted)
+    return max((total - unequal) / (total + unequal), 0.0)
+
+
+@njit(cache=True)
+def _spread_about(target, centre, radius, most):
+    """Number, variances and covariance (n, xx, yy, xy) of the nearest points within a radius, not many more than most."""
+    near, n, x, y, xx, yy, xy = _find_near(target, centre, radius), 0, 0.0, 0.0, 0.0, 0.0, 0.0
+    bound = np.partition(near[:, 2], most - 1)[most - 1] if len(near) > most else np.inf
+    for k in range(len(near)):
+        if near[k, 2] <= bound:
+            u, v = near[k, 0], near[k, 1]
+            n, x, y, xx, yy, xy = n + 1, x + u, y + v, xx + u * u, yy + v * v, xy + u * v
+    x, y = x / n, y / n
+    return n, xx / n - x * x, yy / n - y * y, xy / n - x * y
+
+
+@njit(cache=True)
+def _find_near(target, centre, radius):
+    """Offsets and squared distances (u, v, square) of the points nearer than a radius, shape (n, 3)."""
+    points, starts, _ = target
+    width, found, n = np.int64(np.sqrt(len(starts) - 1)), np.empty((32, 3)), 0
+    i, j = _to_cell(centre[0] - radius), _to_cell(centre[1] - radius)
+    for p in range(i, min(_to_cell(centre[0] + radius) + 1, i + width)):
+        for q in range(j, min(_to_cell(centre[1] + radius) + 1, j + width)):
+            cell = (p & (width - 1)) * width + (q & (width - 1))
+            for k in range(starts[cell], starts[cell + 1]):
+                u, v = points[k, 0] - centre[0], points[k, 1] - centre[1]
+                if u * u + v * v < radius * radius:
+                    if n == len(found):
+                        found = np.concatenate((found, found))
+                    found[n, 0], found[n, 1], found[n, 2] = u, v, u * u + v * v
+                    n += 1
+    return found[:n]
 
 
 # ---- not in the paper: registration to a local map -------------------------------------------------------------
@@ -443,13 +695,13 @@ class LocalMap:
 
     Attributes
     ----------
-    tree : scipy.spatial.cKDTree
-        Of the points, shape (n, 2) [m].
+    cloud : SortedCloud
+        The points, shape (n, 2) [m].
     metrics : array, shape (n, 2, 2)
         Weight M of an offset d from each point, which counts d' M d: the identity, or less along a line.
     """
 
-    tree: cKDTree
+    cloud: SortedCloud
     metrics: np.ndarray
 
 
@@ -539,12 +791,16 @@ def build_local_map(clouds: Sequence[np.ndarray], settings: LocalMapSettings) ->
     owners = np.repeat(np.arange(len(clouds)), [len(cloud) for cloud in clouds])
     cells = np.floor((points - points.min(axis=0)) / settings.cell_m).astype(np.int64)
     _, cells = np.unique(cells @ (2**31, 1), return_inverse=True)
-    views = np.bincount(np.unique(cells * len(clouds) + owners) // len(clouds))
+    seen = np.zeros((cells.max() + 1, len(clouds)), dtype=bool)
+    seen[cells, owners] = True
     means = np.stack([np.bincount(cells, column) for column in points.T], axis=1)
     means /= np.bincount(cells)[:, None]
-    kept = means[views >= min(settings.min_views, (len(clouds) + 1) // 2)]
-    tree = cKDTree(kept)
-    return LocalMap(tree, _line_metrics(tree, settings)) if len(kept) else None
+    kept = means[seen.sum(axis=1) >= min(settings.min_views, (len(clouds) + 1) // 2)]
+    if len(kept) == 0:
+        return None
+    line = float(settings.line_radius_m), float(settings.line_ratio), float(settings.along_weight)
+    cloud = sort_cloud(kept, "local map")
+    return LocalMap(cloud, _line_metrics(cloud, *line))
 
 
 def register_robust(
@@ -581,26 +837,24 @@ def register_robust(
     -----
     A pair with the residual d has the error e = d' M d, M being its map point's, and counts 1 / (1 + e / scale^2)^2 in
     each Gauss-Newton step. A line tells little of a motion along it; that is left to points on none.
+    ``weakest_direction`` is that of these weights; NaN without convergence.
     """
     source, pose = check_cloud(source, "source cloud"), check_poses(init, "initial guess").copy()
     scale = settings.start_scale_m
-    if len(source) > settings.max_points:
-        source = source[np.linspace(0, len(source) - 1, settings.max_points).astype(int)]
-    n_matched, rmse_m = 0, float("nan")
+    source, n_matched, rmse_m = _choose(source, settings.max_points), 0, float("nan")
     for iteration in range(1, settings.max_iterations + 1):
-        moved, residuals, metrics = _find_pairs(transform_points(pose, source), local_map, 3.0 * scale)
-        errors = np.einsum("ni,nij,nj->n", residuals, metrics, residuals)
-        is_near = errors < settings.end_scale_m**2
-        n_matched = int(is_near.sum())
-        weights = (1.0 + errors / scale**2) ** -2.0
-        change = _gauss_newton_step(moved - pose[:2], residuals, metrics, weights)
-        if len(moved) < settings.min_matched or change is None:
+        equations, n_paired, n_matched, error = _sum_equations(
+            pose, source, local_map.cloud, local_map.metrics, (scale, settings.end_scale_m)
+        )
+        change = _solve(equations)
+        if n_paired < settings.min_matched or change is None:
             return IcpResult(pose, n_matched, rmse_m, iteration - 1, False)
-        rmse_m = float(np.sqrt(np.mean(errors[is_near]))) if n_matched else float("nan")
+        rmse_m = float(np.sqrt(error / n_matched)) if n_matched else float("nan")
         pose = np.append(pose[:2] + change[:2], wrap_angle(pose[2] + change[2]))
         shift = np.hypot(*change[:2]) + 30.0 * abs(change[2])
         if scale <= settings.end_scale_m and shift < settings.tolerance:
-            return IcpResult(pose, n_matched, rmse_m, iteration, True)
+            weakest, strongest = np.linalg.eigvalsh(equations[:2, :2])
+            return IcpResult(pose, n_matched, rmse_m, iteration, True, float(weakest / strongest))
         scale = max(0.8 * scale, settings.end_scale_m)
     return IcpResult(pose, n_matched, rmse_m, settings.max_iterations, False)
 
@@ -707,7 +961,9 @@ class _Track:
             if local_map is None or len(source) < settings.min_matched:
                 return guess, 0.0
             if is_searched and settings is self.settings:
-                pose = search_motion(source, local_map.tree.data, guess, reach=self._reach(), max_points=300)
+                pose = search_motion(
+                    source, local_map.cloud.points, guess, reach=self._reach(), max_points=300
+                )
             result = register_robust(source, local_map, pose, settings)
             pose, settings = result.T_target_source, self.fine
             twist = self._twist_to(pose)
@@ -795,45 +1051,47 @@ def _check_stamps(stamps_us: np.ndarray) -> np.ndarray:
     return stamps_us
 
 
-def _line_metrics(tree: cKDTree, settings: LocalMapSettings) -> np.ndarray:
+@njit(cache=True)
+def _line_metrics(cloud, radius, ratio, along_weight):
     """Weights of offsets from each point of a map, by the shape of its surroundings, shape (n, 2, 2)."""
-    points = tree.data
-    near = {"k": min(12, len(points)), "distance_upper_bound": settings.line_radius_m}
-    distances, neighbours = (values.reshape(len(points), -1) for values in tree.query(points, **near))
-    is_near = np.isfinite(distances)
-    offsets = points[np.where(is_near, neighbours, 0)] - points[:, None]
-    offsets *= is_near[..., None]
-    n = is_near.sum(axis=1)
-    means = offsets.sum(axis=1) / n[:, None]
-    xx, yy, xy = (
-        np.sum(offsets[..., i] * offsets[..., j], axis=1) / n - means[:, i] * means[:, j]
-        for i, j in ((0, 0), (1, 1), (0, 1))
-    )
-    unequal = np.hypot(xx - yy, 2.0 * xy)
-    is_line = (n >= 5) & (xx + yy - unequal < settings.line_ratio * (xx + yy + unequal))
-    heading = np.arctan2(2.0 * xy, xx - yy) / 2.0
-    along = np.stack([np.cos(heading), np.sin(heading)], axis=1)
-    freed = np.where(is_line, 1.0 - settings.along_weight, 0.0)
-    return np.eye(2) - freed[:, None, None] * along[:, :, None] * along[:, None, :]
+    metrics = np.empty((len(cloud.points), 2, 2))
+    for k in range(len(metrics)):
+        n, xx, yy, xy = _spread_about(cloud, cloud.points[k], radius, 12)
+        unequal = np.hypot(xx - yy, 2.0 * xy)
+        is_line = n >= 5 and xx + yy - unequal < ratio * (xx + yy + unequal)
+        heading, freed = np.arctan2(2.0 * xy, xx - yy) / 2.0, 1.0 - along_weight if is_line else 0.0
+        c, s = np.cos(heading), np.sin(heading)
+        metrics[k, 0, 0], metrics[k, 1, 1] = 1.0 - freed * c * c, 1.0 - freed * s * s
+        metrics[k, 0, 1] = metrics[k, 1, 0] = -freed * c * s
+    return metrics
 
 
-def _find_pairs(
-    moved: np.ndarray, local_map: LocalMap, reach: float
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Pair points with the map: the points that have a neighbour, their residuals, and its metrics."""
-    distances, neighbours = local_map.tree.query(moved, distance_upper_bound=reach)
-    is_paired = np.isfinite(distances)
-    moved, neighbours = moved[is_paired], neighbours[is_paired]
-    return moved, moved - local_map.tree.data[neighbours], local_map.metrics[neighbours]
+@njit(cache=True)
+def _sum_equations(pose, source, target, metrics, scales):
+    """Sum the weighted normal equations of all pairs, within three times the first scale.
+
+    Returns the Hessian for (x, y, yaw about the source's origin) beside the gradient, shape (3, 4); the number of pairs;
+    that of those nearer than the second scale, and the sum of their errors.
+    """
+    moved, matched, _ = _pair(pose, source, target, (3.0 * scales[0]) ** 2)
+    sums, n_near, near_error = np.zeros((3, 4)), 0, 0.0
+    for k in range(len(moved)):
+        a, b = moved[k, 0] - pose[0], moved[k, 1] - pose[1]
+        x, y = moved[k, 0] - target.points[matched[k], 0], moved[k, 1] - target.points[matched[k], 1]
+        xx, xy, yy = metrics[matched[k], 0, 0], metrics[matched[k], 0, 1], metrics[matched[k], 1, 1]
+        error = xx * x * x + 2.0 * xy * x * y + yy * y * y
+        if error < scales[1] ** 2:
+            n_near, near_error = n_near + 1, near_error + error
+        weight = 1.0 / (1.0 + error / scales[0] ** 2) ** 2
+        for column, (u, v) in enumerate(((1.0, 0.0), (0.0, 1.0), (-b, a), (x, y))):
+            p, q = weight * (xx * u + xy * v), weight * (xy * u + yy * v)
+            sums[0, column] += p
+            sums[1, column] += q
+            sums[2, column] += a * q - b * p
+    return sums, len(moved), n_near, near_error
 
 
-def _gauss_newton_step(
-    arms: np.ndarray, residuals: np.ndarray, metrics: np.ndarray, weights: np.ndarray
-) -> np.ndarray | None:
-    """Motion (x, y, yaw about the source's origin) that lowers the weighted errors most; None if it is not fixed."""
-    jacobian = np.zeros((len(arms), 2, 3))
-    jacobian[:, 0, 0] = jacobian[:, 1, 1] = 1.0
-    jacobian[:, 0, 2], jacobian[:, 1, 2] = -arms[:, 1], arms[:, 0]
-    weighted = (weights[:, None, None] * (metrics @ jacobian)).reshape(-1, 3)
-    hessian, gradient = weighted.T @ jacobian.reshape(-1, 3), weighted.T @ residuals.reshape(-1)
-    return None if np.linalg.cond(hessian) > 1e12 else -np.linalg.solve(hessian, gradient)
+def _solve(equations: np.ndarray) -> np.ndarray | None:
+    """Motion (x, y, yaw) that lowers the weighted errors most; None if it is not fixed."""
+    values, directions = np.linalg.eigh(equations[:, :3])
+    return None if values[0] <= 1e-12 * values[2] else -directions @ (equations[:, 3] @ directions / values)

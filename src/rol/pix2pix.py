@@ -447,6 +447,30 @@ def has_bf16(device: str = "cpu") -> bool:
     return any(test() for test in tests if test is not None)
 
 
+def choose_bf16(bf16: bool | str, device: str = "cpu") -> bool:
+    """Decide whether to multiply in bfloat16.
+
+    Parameters
+    ----------
+    bf16 : bool or "auto"
+        True or False, or "auto": where `has_bf16`.
+    device : str
+        "cpu" or "cuda".
+
+    Returns
+    -------
+    bf16 : bool
+
+    Raises
+    ------
+    Pix2PixError
+        If the value is none of these.
+    """
+    if not isinstance(bf16, bool) and bf16 != "auto":
+        raise Pix2PixError(f'bf16: expected true, false or "auto", got {bf16!r}')
+    return has_bf16(device) if bf16 == "auto" else bool(bf16)
+
+
 def to_tensor(image: np.ndarray) -> Tensor:
     """Turn a grey image into a tensor: 0 becomes -1, 255 becomes +1.
 

@@ -73,7 +73,13 @@ def area_under_curve(real: np.ndarray, virtual: np.ndarray) -> float:
 
 
 def tell_apart(
-    real: np.ndarray, virtual: np.ndarray, rng: np.random.Generator, *, folds: int = 3, epochs: int = 4
+    real: np.ndarray,
+    virtual: np.ndarray,
+    rng: np.random.Generator,
+    *,
+    folds: int = 3,
+    epochs: int = 4,
+    bf16: bool = False,
 ) -> Verdict:
     """Train classifiers on some scans and judge them on the others.
 
@@ -88,6 +94,8 @@ def tell_apart(
         Groups of neighbouring scans; each is left out once and judged by a network trained on the others.
     epochs : int
         Passes over the patches.
+    bf16 : bool
+        Multiply in bfloat16, see `rol.pix2pix.has_bf16`; takes half the time there.
 
     Returns
     -------
@@ -104,8 +112,8 @@ def tell_apart(
     scores, aucs = np.empty(patches.shape[:4]), []
     for left_out in np.array_split(np.arange(len(real)), folds):
         learnt = np.setdiff1d(np.arange(len(real)), left_out)
-        classifier = _train(patches[:, learnt], rng, epochs)
-        scores[:, left_out] = _score(classifier, patches[:, left_out])
+        classifier = _train(patches[:, learnt], rng, epochs, bf16)
+        scores[:, left_out] = _score(classifier, patches[:, left_out], bf16)
         aucs.append(area_under_curve(*scores[:, left_out]))
     return Verdict(area_under_curve(*scores), np.array(aucs), scores)
 
@@ -147,18 +155,18 @@ def give_aways(verdict: Verdict, real: np.ndarray, virtual: np.ndarray) -> dict[
     return found
 
 
-def _train(patches: np.ndarray, rng: np.random.Generator, epochs: int):
+def _train(patches: np.ndarray, rng: np.random.Generator, epochs: int, bf16: bool):
     """A network of 3 convolutions, trained by Adam; `patches` has shape (2, n, rows, bins, 16, 64)."""
     import torch
     from torch import nn
 
     torch.manual_seed(int(rng.integers(2**31)))
     classifier = nn.Sequential(
-        nn.Conv2d(1, 16, 5, padding=2), nn.ReLU(), nn.MaxPool2d(2),
-        nn.Conv2d(16, 32, 3, padding=1), nn.ReLU(), nn.MaxPool2d(2),
+        nn.Conv2d(1, 16, 5, padding=2), nn.MaxPool2d(2), nn.ReLU(),  # on a quarter of the values
+        nn.Conv2d(16, 32, 3, padding=1), nn.MaxPool2d(2), nn.ReLU(),
         nn.Conv2d(32, 48, 3, padding=1), nn.ReLU(), nn.AdaptiveAvgPool2d(1), nn.Flatten(),
         nn.Linear(48, 32), nn.ReLU(), nn.Linear(32, 1),
-    )  # fmt: skip
+    ).to(memory_format=torch.channels_last)  # fmt: skip
     flat = patches.reshape(2, -1, 1, ROWS, BINS)
     images = torch.from_numpy(flat.reshape(-1, 1, ROWS, BINS))
     labels = torch.cat([torch.ones(flat.shape[1]), torch.zeros(flat.shape[1])])
@@ -167,9 +175,9 @@ def _train(patches: np.ndarray, rng: np.random.Generator, epochs: int):
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, 3e-3, total_steps=epochs * n_batches)
     for _ in range(epochs):
         for batch in np.array_split(rng.permutation(len(images)), n_batches):
-            loss = nn.functional.binary_cross_entropy_with_logits(
-                classifier(_scale(images[batch]))[:, 0], labels[batch]
-            )
+            with torch.autocast("cpu", torch.bfloat16, enabled=bf16):
+                logits = classifier(_scale(images[batch]))[:, 0]
+            loss = nn.functional.binary_cross_entropy_with_logits(logits.float(), labels[batch])
             optimiser.zero_grad()
             loss.backward()
             optimiser.step()
@@ -177,14 +185,16 @@ def _train(patches: np.ndarray, rng: np.random.Generator, epochs: int):
     return classifier.eval()
 
 
-def _score(classifier, patches: np.ndarray) -> np.ndarray:
+def _score(classifier, patches: np.ndarray, bf16: bool) -> np.ndarray:
     import torch
 
     images = torch.from_numpy(patches.reshape(-1, 1, ROWS, BINS))
-    with torch.no_grad():
-        scores = [classifier(_scale(part))[:, 0] for part in images.split(2048)]
+    with torch.no_grad(), torch.autocast("cpu", torch.bfloat16, enabled=bf16):
+        scores = [classifier(_scale(part))[:, 0].float() for part in images.split(2048)]
     return torch.cat(scores).numpy().reshape(patches.shape[:4])
 
 
 def _scale(images):
-    return images.float() / 32.0 - 0.5
+    import torch
+
+    return (images.float() / 32.0 - 0.5).contiguous(memory_format=torch.channels_last)
