@@ -1,9 +1,11 @@
 # make book        set up, run the chapters on the demo profile, render the book
 # make test        set up, then lint, unit tests, all chapters on the smoke profile, and checks of what came out
+# make check       compare the numbers of a build with the reference (PROFILE=demo; RUN=.../metrics.json: one rerun)
 # make notebooks   make book, then renew the executed notebooks stored in notebooks/
 # make weights     train a network of data/weights/recipe.yaml (NETWORK=rol) and put its weights into data/weights
 # make judge       judge the weights of a network (NETWORK=rol) again and compare with their card
-# make real        clone the public repositories with the small pieces of real data into data/real
+# make real        fetch the small pieces of real data from public repositories into data/real (CHECK=1: only check them)
+# make archive     one zip of code, executed notebooks, book and results with an RO-Crate, after make book
 # make clean       remove everything made by the above but .venv, data/real and the sessions that networks learn from
 #
 # Nothing is needed but Python 3.11 or 3.12, make and git; everything is installed into .venv.
@@ -11,7 +13,7 @@
 SHELL := bash
 .SHELLFLAGS := -eu -o pipefail -c
 .DEFAULT_GOAL := help
-.PHONY: help setup book test notebooks weights judge real lint format clean
+.PHONY: help setup book test check notebooks weights judge real archive lint format clean
 
 # UTF-8 whatever the locale is, also in the tools that are called.
 export PYTHONUTF8 := 1
@@ -35,6 +37,7 @@ $(STAMP):
 book: $(STAMP)
 	@time $(SNAKEMAKE) book --nolock --prioritize pix2pix --rerun-incomplete --retries 1 --scheduler greedy --quiet host reason
 	@echo "The book: $$($(BIN)/python workflow/stage_book.py --where config/$(PROFILE).yaml) (open it in a browser, no network needed)"
+	@$(BIN)/python workflow/check.py config/$(PROFILE).yaml || true
 
 test: $(STAMP) lint
 	@mkdir -p build/test
@@ -48,8 +51,12 @@ test: $(STAMP) lint
 	@echo "every module by itself (unit tests):"
 	@tail -n 1 build/test/unit.log
 
+check: $(STAMP)
+	@$(BIN)/python workflow/check.py config/$(PROFILE).yaml $(if $(RUN),--run "$(RUN)")
+
 notebooks: book
 	@$(BIN)/python workflow/renew_notebooks.py config/demo.yaml
+	@$(BIN)/python workflow/check.py --renew config/demo.yaml
 
 weights: $(STAMP)
 	@OMP_WAIT_POLICY=PASSIVE $(BIN)/python workflow/train_weights.py data/weights/recipe.yaml $(NETWORK) --threads $(CORES)
@@ -57,15 +64,11 @@ weights: $(STAMP)
 judge: $(STAMP)
 	@OMP_WAIT_POLICY=PASSIVE $(BIN)/python workflow/train_weights.py data/weights/recipe.yaml $(NETWORK) --threads $(CORES) --judge
 
-real:
-	@mkdir -p data/real
-	@for repository in ZJUYH/RaLL Samleo8/RadarSLAMPy marcelsheeny/radiate_sdk; do \
-	    folder=data/real/$${repository#*/}; \
-	    if [ -d "$$folder" ]; then echo "$$folder is there"; continue; fi; \
-	    rm -rf "$$folder.part"; \
-	    git clone --depth 1 "https://github.com/$$repository.git" "$$folder.part"; \
-	    mv "$$folder.part" "$$folder"; \
-	done
+real: $(STAMP)
+	@$(BIN)/python workflow/get_real.py $(if $(CHECK),--check)
+
+archive: $(STAMP)
+	@$(BIN)/python workflow/archive.py config/$(PROFILE).yaml
 
 lint: $(STAMP)
 	@$(BIN)/ruff check

@@ -115,7 +115,6 @@ def test_notebook_builds_every_path_from_its_parameters(path: Path) -> None:
     defaults = chapters.notebook_parameters(path)
     assert "out_dir" in defaults
     rest = "\n".join(chapters.code_cells(chapters.read_notebook(path))[1:])
-    rest = rest.replace('"../shared/real"', "")  # where real data may lie besides `real_root`
     assert "build/demo" not in rest and "../" not in rest and "data/sessions" not in rest
 
 

@@ -28,7 +28,7 @@ def test_real_odometry_follows_the_real_poses(real_root: Path) -> None:
 
 
 def test_real_scan_poses(real_root: Path) -> None:
-    poses = rall.load_scan_poses(real_root / rall.SCAN_POSES_PATH)
+    poses = rall.load_scan_poses(rall.find_scan_poses(real_root))
     assert len(poses) == 11 and min(poses) == 1547131046353776
     np.testing.assert_allclose(poses[1547131046353776], [146.619, -10.956, -0.06091])
 
@@ -84,13 +84,29 @@ def test_find_real_root(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None
     monkeypatch.chdir(tmp_path)
     monkeypatch.delenv("ROL_REAL_ROOT", raising=False)
     assert rall.find_real_root() is None and rall.find_real_root(tmp_path) is None
+    with pytest.raises(rall.RallError, match="real_root: there is no folder .*elsewhere"):
+        rall.find_real_root(tmp_path / "elsewhere")
     path = tmp_path / "here" / rall.MAP_PATH
     path.parent.mkdir(parents=True)
     path.write_bytes(b"")
     assert rall.find_real_root(tmp_path / "here") == tmp_path / "here"
     monkeypatch.setenv("ROL_REAL_ROOT", str(tmp_path / "here"))
     assert rall.find_real_root() == tmp_path / "here"
-    assert rall.find_real_root(tmp_path / "elsewhere") is None  # what is asked for by name is not replaced
+    assert rall.find_real_root(tmp_path) is None  # what is asked for by name is not replaced
+    (tmp_path / "data").mkdir()
+    (tmp_path / "data" / "real").symlink_to(tmp_path / "here")
+    monkeypatch.setenv("ROL_REAL_ROOT", str(tmp_path))
+    assert rall.find_real_root() is None
+    monkeypatch.delenv("ROL_REAL_ROOT")
+    assert rall.find_real_root() == Path("data/real")
+
+
+def test_scan_poses_come_with_the_project(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(Path(__file__).parents[1])
+    shipped = rall.find_scan_poses(tmp_path)
+    assert len(rall.load_scan_poses(shipped)) == 11
+    (tmp_path / rall.SCAN_POSES_PATH).write_text("timestamp_us,x_m,y_m,yaw_rad\n1,0,0,0\n")
+    assert list(rall.load_scan_poses(rall.find_scan_poses(tmp_path))) == [1]
 
 
 def test_map_cells_lie_where_the_readme_says(tmp_path: Path) -> None:

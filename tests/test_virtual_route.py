@@ -278,6 +278,8 @@ def test_faulty_route_settings_are_named(small_root: Path, tmp_path: Path, chang
 
 def test_route_without_real_data_says_how_to_get_them(tmp_path: Path) -> None:
     with pytest.raises(SettingsError, match=r"no real data in .*; run `make real` or set ROL_REAL_ROOT"):
+        build_session(load_settings(recipe(tmp_path, tmp_path)), NAME)
+    with pytest.raises(rall.RallError, match="real_root: there is no folder .*nowhere"):
         build_session(load_settings(recipe(tmp_path, tmp_path / "nowhere")), NAME)
     with pytest.raises(SettingsError, match="neither 'town' nor 'route'"):
         parse_settings({"world": "moon"})
@@ -287,7 +289,7 @@ def test_route_without_real_data_says_how_to_get_them(tmp_path: Path) -> None:
 
 def test_twins_stand_where_the_real_scans_stood(real_root: Path) -> None:
     twins = build_twins(real_root, seed=2)
-    known = rall.load_scan_poses(real_root / rall.SCAN_POSES_PATH)
+    known = rall.load_scan_poses(rall.find_scan_poses(real_root))
     np.testing.assert_array_equal(twins.scans_us, list(known))
     np.testing.assert_allclose(twins.drive.pose(twins.scans_us + 125_000), list(known.values()), atol=1e-4)
     assert make_scan(twins, 0).stamp_us == twins.scans_us[0]

@@ -8,9 +8,7 @@ from __future__ import annotations
 
 import base64
 import datetime
-import importlib.metadata
 import os
-import platform
 import re
 import shutil
 import subprocess
@@ -22,6 +20,7 @@ from urllib.parse import urlsplit
 import nbformat
 import yaml
 
+import check
 from chapters import (
     CHAPTERS,
     NOTEBOOKS,
@@ -37,7 +36,6 @@ from chapters import (
 from rol.files import read_text, write_text
 from toolbox_pages import stage_toolbox
 
-VERSIONS_SHOWN = "numpy scipy opencv-python-headless numba pandas torch open3d-cpu matplotlib papermill snakemake jupyter-book"
 # The picture of the first page is taken from a run: the first of these that there is, and what the page says of it.
 RESULT_FIGURES = (
     ("10_real_radar", "fig-story", "real.md"),
@@ -277,42 +275,71 @@ def git(*words: str) -> str:
     return answer.stdout.strip() if answer.returncode == 0 else ""
 
 
+def commit() -> str:
+    """Name the commit of the working tree, where git knows it."""
+    known = git("rev-parse", "HEAD") or "not known (no git repository)"
+    changed = git("status", "--porcelain", "--untracked-files=no")
+    return known + (", with changes that are not committed" if changed else "")
+
+
+def markdown_table(header: list[str], lines: list[list[str]]) -> str:
+    """Write a table in Markdown."""
+    cells = [header, ["---"] * len(header), *lines]
+    return "\n".join("| " + " | ".join(cell.replace("|", r"\|") for cell in line) + " |" for line in cells)
+
+
+def reproduced_page(config: dict) -> str:
+    """Fill the page that compares this build with the reference; without a reference its tables are empty."""
+    has_reference = (check.REFERENCE / f"{config['profile']}.json").is_file()
+    rows = check.compare_build(config) if has_reference else []
+    made_on = check.read_reference(config["profile"])["machine"] if has_reference else {}
+    tables = []
+    for chapter in sorted({row.entry["chapter"] for row in rows}):
+        lines = [
+            [*row.cells(), f"{row.entry['kind']}: {row.entry['reason']}"]
+            for row in rows
+            if row.entry["chapter"] == chapter
+        ]
+        header = ["number", "reference", "this build", "tolerance", "result", "depends on"]
+        title = f"### [Chapter {int(chapter[:2])}](notebooks/{chapter}.ipynb)"
+        tables.append(f"{title}\n\n{markdown_table(header, lines)}")
+    counts = [[result, str(n)] for result, n in [*check.count_results(rows).items(), ("all", len(rows))]]
+    here = check.machine() | {"Commit": commit()}
+    parts = {
+        "counts": markdown_table(["result", "numbers"], counts),
+        "numbers": "\n\n".join(tables),
+        "machine": markdown_table(
+            ["what", "reference", "this build"], [[k, made_on.get(k, ""), v] for k, v in here.items()]
+        ),
+    }
+    text = read_text(check.PAGE)
+    for name, part in parts.items():
+        text = text.replace(f"{{{{ {name} }}}}", part)
+    return text
+
+
 def how_made_page(config: dict, config_path: str) -> str:
     """Write the page that says when, from what, with what and in what time the book was made."""
-    commit = git("rev-parse", "HEAD") or "not known (no git repository)"
-    if git("status", "--porcelain", "--untracked-files=no"):
-        commit += ", with changes that are not committed"
     rows = [
-        ("Made", datetime.datetime.now(datetime.UTC).strftime("%Y-%m-%d %H:%M UTC")),
-        ("Commit", commit),
-        ("Profile", f"`{config_path}`"),
-        ("Machine", f"{platform.system()} {platform.machine()}, Python {platform.python_version()}"),
-        *((name, importlib.metadata.version(name)) for name in VERSIONS_SHOWN.split() if installed(name)),
+        ["Made", datetime.datetime.now(datetime.UTC).strftime("%Y-%m-%d %H:%M UTC")],
+        ["Commit", commit()],
+        ["Profile", f"`{config_path}`"],
+        *([name, value] for name, value in check.machine().items()),
     ]
-    lines = [
+    times = [
+        [run.chapter, run.session, run.method, f"{metadata.papermill.duration:.0f}"]
+        for run in all_runs(config)
+        for metadata in [nbformat.read(run.path(config["out_dir"]), as_version=4).metadata]
+    ]
+    parts = [
         "# How this book was made",
-        "",
-        "| what | |",
-        "|---|---|",
-        *(f"| {k} | {v} |" for k, v in rows),
-        "",
-    ]
-    lines += [
+        markdown_table(["what", "this build"], rows),
         "## Time that each chapter took",
-        "",
-        "| chapter | session | method | s |",
-        "|---|---|---|---:|",
+        markdown_table(["chapter", "session", "method", "s"], times),
+        "## The profile",
+        f"```yaml\n{read_text(config_path).strip()}\n```",
     ]
-    for run in all_runs(config):
-        metadata = nbformat.read(run.path(config["out_dir"]), as_version=4).metadata
-        lines.append(f"| {run.chapter} | {run.session} | {run.method} | {metadata.papermill.duration:.0f} |")
-    lines += ["", "## The profile", "", "```yaml", read_text(config_path).strip(), "```", ""]
-    return "\n".join(lines)
-
-
-def installed(name: str) -> bool:
-    """Say whether a distribution is installed."""
-    return bool(list(importlib.metadata.distributions(name=name)))
+    return "\n\n".join(parts) + "\n"
 
 
 def clear(book: Path) -> None:
@@ -335,6 +362,7 @@ def stage(config_path: str) -> Path:
     stage_result_figure(config, book)
     modules = stage_toolbox(book)
     write_text(book / "made.md", how_made_page(config, config_path))
+    write_text(book / "did_it_reproduce.md", reproduced_page(config))
     pages = book_pages(config)
     for page in book.glob("*.md"):
         write_text(page, point_to_pages(read_text(page), pages))

@@ -119,7 +119,7 @@ def open_real() -> tuple[list[Any], Any] | None:
     from rol import rall
 
     root = rall.find_real_root()
-    if root is None or not (root / rall.SCAN_POSES_PATH).is_file():
+    if root is None or not (root / rall.SCANS_PATH).is_dir():
         say("no real scans at hand: the network is judged on virtual places alone")
         return None
     return rall.load_scans(root), cKDTree(rall.load_map_points(root / rall.MAP_PATH))

@@ -23,7 +23,7 @@ MAP_PATH = Path("RaLL/data/maps/RobotCar/png/oxford_laser_map.png")
 POSES_PATH = Path("RaLL/data/gt_poses/RobotCar")
 ODOMETRY_PATH = Path("RaLL/data/odom/RobotCar")
 SCANS_PATH = Path("RadarSLAMPy/data/tiny")
-SCAN_POSES_PATH = Path("oxford_scan_map_poses.csv")
+SCAN_POSES_PATH = Path("oxford_scan_map_poses.csv")  # in no public repository, so it comes with the book
 MAP_CELL = 0.25  # side of a pixel of the map [m]
 MAP_SHAPE = (8000, 8000)  # of the published picture; of another one nobody knows where its pixels lie
 MAP_CORNER = (
@@ -68,19 +68,28 @@ def find_real_root(given: str | Path = "") -> Path | None:
     Parameters
     ----------
     given : path
-        Where to look; if empty, the environment variable ROL_REAL_ROOT, `data/real` and `../shared/real` are
-        tried in this order.
+        The folder; if empty, the environment variable ROL_REAL_ROOT, and `data/real` where that is not set.
 
     Returns
     -------
     root : Path or None
-        The first of these folders that holds the lidar map, or None.
+        The folder, or None if it does not hold the lidar map.
+
+    Raises
+    ------
+    RallError
+        If a folder is given and does not exist.
     """
-    places = [given] if given else [os.environ.get("ROL_REAL_ROOT"), "data/real", "../shared/real"]
-    for place in places:
-        if place and (Path(place) / MAP_PATH).is_file():
-            return Path(place)
-    return None
+    if given and not Path(given).is_dir():
+        raise RallError(f"real_root: there is no folder {given}")
+    root = Path(given or os.environ.get("ROL_REAL_ROOT") or "data/real")
+    return root if (root / MAP_PATH).is_file() else None
+
+
+def find_scan_poses(real_root: Path | str) -> Path:
+    """Find the file with the map poses of single scans: under `real_root`, else the one in `data`."""
+    own = Path(real_root) / SCAN_POSES_PATH
+    return own if own.is_file() else Path("data") / SCAN_POSES_PATH
 
 
 def load_map_points(path: Path | str, shape: tuple[int, int] | None = None) -> np.ndarray:
@@ -213,7 +222,7 @@ def load_scans(real_root: Path | str) -> list[RealScan]:
     -------
     scans : list of RealScan
         In the order of time: every scan under ``RadarSLAMPy/data/tiny/radar`` with a row in
-        ``oxford_scan_map_poses.csv``. The velocity is that of the official odometry beside the scans; of a scan
+        ``oxford_scan_map_poses.csv``, see `find_scan_poses`. The velocity is that of the official odometry beside the scans; of a scan
         that it does not cover, that between the poses of neighbours less than a second away, if there is one.
 
     Raises
@@ -225,7 +234,7 @@ def load_scans(real_root: Path | str) -> list[RealScan]:
     """
     from .oxford import load_radar
 
-    folder, poses = Path(real_root) / SCANS_PATH / "radar", load_scan_poses(Path(real_root) / SCAN_POSES_PATH)
+    folder, poses = Path(real_root) / SCANS_PATH / "radar", load_scan_poses(find_scan_poses(real_root))
     stamps = sorted(stamp for stamp in poses if (folder / f"{stamp}.png").is_file())
     if not stamps:
         raise RallError(f"{folder}: holds none of the {len(poses)} scans of {SCAN_POSES_PATH}")

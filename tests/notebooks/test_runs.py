@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pandas as pd
 import pytest
+import yaml
 
 from chapters import (
     ROOT,
@@ -18,6 +19,7 @@ from chapters import (
     read_notebook,
     run_parameters,
 )
+from rol.rall import find_real_root
 
 METRICS = {
     *("method", "session", "n_scans", "failures", "rmse_m", "rmse_yaw_deg"),
@@ -68,7 +70,7 @@ def test_every_real_scan_is_judged(profile: dict, real_root: Path) -> None:
     assert set(rows["timestamp_us"]) == stamps
     assert rows[shares].stack().between(0.0, 1.0).all()
     # Found from 5 m and 5 deg off; where a drive has four scans, near the fitted poses from the fourth on.
-    fitted = pd.read_csv(real_root / "oxford_scan_map_poses.csv").set_index("timestamp_us")
+    fitted = pd.read_csv("data/oxford_scan_map_poses.csv").set_index("timestamp_us")
     fitted = fitted.loc[rows["timestamp_us"]].reset_index()
     names = ["x_m", "y_m", "yaw_rad"]
     drive = (rows["timestamp_us"].diff() > 1_000_000).cumsum()
@@ -77,6 +79,15 @@ def test_every_real_scan_is_judged(profile: dict, real_root: Path) -> None:
     assert rows[names].notna().all(axis=None) and is_late.any()
     assert ((off["x_m"] ** 2 + off["y_m"] ** 2) ** 0.5 < 0.6).all()
     assert (off["yaw_rad"].abs() < 0.6 * 3.1416 / 180.0).all()
+
+
+def test_every_output_of_the_codecheck_manifest_is_there(profile: dict) -> None:
+    demo = load_config(ROOT / "config" / "demo.yaml")
+    for item in yaml.safe_load((ROOT / "codecheck.yml").read_text())["manifest"]:
+        path = Path(item["file"].replace(demo["out_dir"], profile["out_dir"], 1))
+        path = Path(str(path).replace(demo["book_dir"], profile["book_dir"], 1))
+        if "make real" not in item["comment"] or find_real_root(profile.get("real_root", "")):
+            assert path.is_file(), path
 
 
 @pytest.mark.parametrize("profile", ["smoke"], indirect=True)

@@ -165,7 +165,7 @@ def load_route(settings: VirtualSettings, own: SessionSettings) -> np.ndarray:
     root = rall.find_real_root(settings.real_root)
     if root is None:
         raise SettingsError(
-            f"virtual: world: route: no real data in {settings.real_root or 'any of the usual places'}; "
+            f"virtual: world: route: no real data in {settings.real_root or 'ROL_REAL_ROOT or data/real'}; "
             "run `make real` or set ROL_REAL_ROOT"
         )
     path = root / rall.POSES_PATH / f"pose_xy_{own.poses}.txt"
@@ -265,7 +265,7 @@ def build_twins(real_root: Path | str, seed: int = 1, margin_s: float = 30.0) ->
     from .scene import Scene
     from .settings import SessionSettings, VirtualSettings
 
-    known = rall.load_scan_poses(Path(real_root) / rall.SCAN_POSES_PATH)
+    known = rall.load_scan_poses(rall.find_scan_poses(real_root))
     stamps, poses = np.array(list(known), dtype=np.int64), np.array(list(known.values()))
     turns = np.full(len(stamps), 250_000, dtype=np.int64)
     name = "virtual-twins"

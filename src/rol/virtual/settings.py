@@ -103,7 +103,7 @@ class VirtualSettings:
     world : str
         "town": a town drawn from the seed; "route": the world of the real lidar map, driven along real poses.
     real_root : str
-        World "route" only: folder of the real data; empty: the usual places, see `rall.find_real_root`.
+        World "route" only: folder of the real data; may be empty, see `rall.find_real_root`.
     unmapped_share : float
         World "route" only: things that the map does not show, as a share of the groups of cells that it shows.
     lidar, radar : dict
