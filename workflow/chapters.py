@@ -14,6 +14,7 @@ import shlex
 import tokenize
 from collections.abc import Iterable
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
 import nbformat
@@ -237,6 +238,7 @@ def papermill_arguments(parameters: dict) -> str:
 # ---- digests --------------------------------------------------------------------------------------------------
 
 
+@cache  # chapters share most of their modules
 def code_text(source: str) -> str:
     """Reduce Python source to what can change a result: without comments, docstrings and blank lines."""
     lines = source.splitlines()
@@ -261,7 +263,8 @@ def code_cells(notebook: nbformat.NotebookNode) -> list[str]:
     ]
 
 
-def imported_modules(source: str, package: tuple[str, ...] = ()) -> set[tuple[str, ...]]:
+@cache
+def imported_modules(source: str, package: tuple[str, ...] = ()) -> frozenset[tuple[str, ...]]:
     """List the names below ``rol`` that a piece of source imports, as paths such as ``("virtual", "scene")``.
 
     Parameters
@@ -284,7 +287,7 @@ def imported_modules(source: str, package: tuple[str, ...] = ()) -> set[tuple[st
         else:
             continue
         found |= {name[1:] for name in names if name[:1] == ("rol",)}
-    return found
+    return frozenset(found)
 
 
 def module_files(sources: Iterable[str], package_root: Path = PACKAGE) -> list[Path]:
