@@ -8,7 +8,7 @@
 # make archive     one zip of code, executed notebooks, book and results with an RO-Crate, after make book
 # make clean       remove everything made by the above but .venv, data/real and the sessions that networks learn from
 #
-# Nothing is needed but Python 3.11 or 3.12, make and git; everything is installed into .venv.
+# README.md names what the system must have; everything else is installed into .venv.
 
 SHELL := bash
 .SHELLFLAGS := -eu -o pipefail -c

@@ -23,7 +23,7 @@ if not workflow.configfiles:
     configfile: "config/demo.yaml"
 
 CONFIG_FILE = os.path.relpath(workflow.configfiles[-1])
-if workflow.is_main_process and not workflow.output_settings.dryrun:
+if workflow.is_main_process and not workflow.output_settings.dryrun:  # the Snakemake of a job is no main process
     run_lock.wait_for_lock(".snakemake/run.lock", CONFIG_FILE)
 chapters.check_config(config, CONFIG_FILE)
 SESSIONS_ROOT, OUT, BOOK = config["sessions_root"], config["out_dir"], config["book_dir"]
@@ -34,7 +34,7 @@ PARAMETERS = {run: chapters.run_parameters(config, run) for run in RUNS}  # a na
 DIGESTS = {chapter: chapters.chapter_digest(NOTEBOOKS / f"{chapter}.ipynb") for chapter in chapters.CHAPTERS}
 TRANSLATION = chapters.translation(config)  # network and options of the generated images, those of chapter 05
 RECIPES = (config["virtual"] or {}).get("sessions", {})
-SHIPPED = [str(path) for path in sorted(Path("data/weights").glob("*.safetensors"))]  # networks that come with the book
+SHIPPED = [str(path) for path in sorted(Path("data/weights").glob("[!.]*.safetensors"))]  # networks that come with the book
 PYTHON, JUPYTER_BOOK = sys.executable, Path(sys.executable).with_name("jupyter-book")
 
 # One job uses the threads it was given and no more, and threads that wait leave the processor to others.
@@ -97,8 +97,8 @@ rule book:
     input:
         notebooks=[run.path(OUT) for run in RUNS],
         sources=[f"notebooks/{chapter}.ipynb" for chapter in chapters.CHAPTERS],
-        pages=[str(path) for path in sorted(Path("book").rglob("*")) if path.is_file()],
-        modules=[str(path) for path in sorted(Path("src/rol").rglob("*.py"))],
+        pages=[str(path) for path in sorted(Path("book").rglob("[!.]*")) if path.is_file()],
+        modules=[str(path) for path in sorted(Path("src/rol").rglob("[!.]*.py"))],
         stage=["workflow/stage_book.py", "workflow/toolbox_pages.py", "workflow/check.py"],
         reference=[str(path) for path in sorted(Path("data/reference").glob("*.json"))],
     output:
@@ -310,7 +310,7 @@ rule results:
         notebook=source("08_results"),
         metrics=expand(OUT + "/localization/{session}/{method}/metrics.json", session=LOCALIZE, method=METHODS),
         summary=f"{OUT}/maps/summary.json",
-        tables=[str(path) for path in sorted(Path("data/paper").glob("*.csv"))],
+        tables=[str(path) for path in sorted(Path("data/paper").glob("[!.]*.csv"))],
     output:
         notebook=executed("08_results"),
     log:
@@ -327,7 +327,7 @@ rule results:
 rule oxford_route:
     input:
         notebook=source("09_oxford_route"),
-        tables=[str(path) for path in sorted(Path("data/paper").glob("*.csv"))],
+        tables=[str(path) for path in sorted(Path("data/paper").glob("[!.]*.csv"))],
         measured=[str(path) for path in sorted(Path("data/ablations").glob("route_*.csv"))],
     output:
         notebook=executed("09_oxford_route"),
@@ -364,7 +364,7 @@ rule real_radar:
 rule ablations:
     input:
         notebook=source("11_ablations"),
-        tables=[str(path) for path in sorted(Path("data/ablations").glob("*.csv"))],
+        tables=[str(path) for path in sorted(Path("data/ablations").glob("[!.]*.csv"))],
         cards=[path.replace(".safetensors", ".json") for path in SHIPPED],
     output:
         notebook=executed("11_ablations"),
@@ -383,7 +383,7 @@ rule ablations:
 rule performance:
     input:
         notebook=source("12_performance"),
-        measured=[str(path) for path in sorted(Path("data/performance").glob("*.json"))],
+        measured=[str(path) for path in sorted(Path("data/performance").glob("[!.]*.json"))],
     output:
         notebook=executed("12_performance"),
     log:

@@ -35,7 +35,7 @@ HEADER = "output_file\tdate\trule\tlog-file(s)\tinput-file(s)\tshellcmd\tstatus\
 def summary_line(run: Run, more: str = "", plan: str = "no update", status: str = "ok") -> str:
     """Line of Snakemake's summary for the executed notebook of a run, or another output of it."""
     source, output = f"notebooks/{run.chapter}.ipynb", run.path(CONFIG["out_dir"]).as_posix()
-    command = f"env A=1 /some/where/bin/python3 -m papermill {source} {output} > log"
+    command = f"env A=1 /some/where/bin/python -m papermill {source} {output} > log"
     words = [
         more or output,
         "today",
@@ -93,9 +93,14 @@ def write(path: Path, text: str) -> Path:
 def summary() -> str:
     runs = chapters.all_runs(CONFIG)
     made = [*map(summary_line, runs), summary_line(runs[0], "build/tiny/alignment/train/a.csv")]
-    page = f"{CONFIG['book_dir']}/_build/html/index.html"
-    book = [page, "today", "book", "-", "notebooks/08_results.ipynb", "python stage > log", "ok", "no update"]
-    return HEADER + "".join(made) + "\t".join(book)
+    page, run_of = f"{CONFIG['book_dir']}/_build/html/index.html", "today\t{}\t-\t{}\t{}\tok\tno update\n"
+    book = run_of.format(
+        "book", "notebooks/08_results.ipynb", "'/a b/bin/python' stage.py && /a/bin/jupyter-book ."
+    )
+    session = run_of.format(
+        "virtual_session", "", "[ -e a ] || rm b; echo c > d; /a/bin/python -m e || { tail; }"
+    )
+    return HEADER + "".join(made) + f"{page}\t{book}{SESSION}\t{session}"
 
 
 def test_archive_holds_code_notebooks_book_and_results(project: Path) -> None:
@@ -134,8 +139,10 @@ def test_crate_lists_which_command_made_which_file_from_which_inputs(project: Pa
     for file in crate.data_entities:
         assert (tmp_path / "unzipped" / file.id).is_file(), file.id
     actions = {action["result"][0].id: action for action in crate.root_dataset["mentions"]}
-    assert len(actions) == 4
-    assert actions["build/tiny/book/_build/html/index.html"]["instrument"].id == "Snakefile"
+    assert len(actions) == 5
+    book, session = actions["build/tiny/book/_build/html/index.html"], actions[f"#{SESSION}"]
+    assert book["instrument"].id == "Snakefile" and book["description"] == "python stage.py && jupyter-book ."
+    assert session["description"] == "[ -e a ] || rm b; echo c > d; python -m e" and not session["object"]
     action = actions["build/tiny/notebooks/02_alignment/train.ipynb"]
     made = {result.id for result in action["result"]}
     assert made == {

@@ -57,7 +57,7 @@ def build(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> dict:
     glue(tmp_path / "out/notebooks/01_sessions.ipynb", words="88 % of 1,234.5 peaks")
     metrics = {"session": "seq01", "method": "paper", "seed": 1, "rmse_m": 0.25}
     write_json(tmp_path / "out/localization/seq01/paper/metrics.json", metrics)
-    (tmp_path / "out/scans.csv").write_text("stamp,share\n1,0.25\n2,0.75\n")
+    (tmp_path / "out/scans.csv").write_text("stamp,share\n1,0.25\n2,0.75\n", encoding="utf-8")
     write_reference(tmp_path, ENTRIES)
     return {"profile": "tiny", "seed": 1, "out_dir": str(tmp_path / "out")}
 
@@ -168,7 +168,7 @@ def test_rerun_with_another_seed_is_compared_within_the_spread(
 
 @pytest.mark.parametrize("text", ["", "[]", '{"session": "seq01"}'])
 def test_file_that_is_no_metrics_is_refused(build: dict, tmp_path: Path, text: str) -> None:
-    (tmp_path / "mine.json").write_text(text)
+    (tmp_path / "mine.json").write_text(text, encoding="utf-8")
     with pytest.raises(ChapterError, match="mine.json: not a readable metrics.json"):
         check.compare_run(check.read_reference("tiny"), tmp_path / "mine.json")
 

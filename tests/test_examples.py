@@ -114,7 +114,7 @@ def code_blocks(page: Path, section: str) -> list[tuple[str, str]]:
 
 
 def test_every_file_has_an_example() -> None:
-    files = {file.stem for file in PACKAGE.glob("*.py") if not file.name.startswith("__")}
+    files = {file.stem for file in PACKAGE.glob("[!.]*.py") if not file.name.startswith("__")}
     assert set(EXAMPLES) == files | {"virtual"}
 
 
@@ -143,7 +143,7 @@ def test_page_names_all_that_a_file_needs(name: str) -> None:
 
 def follow_imports(start: Path) -> tuple[set[str], set[str]]:
     """Find the other files that a file, or those in a folder, import in turn, and all packages that they import."""
-    inside = sorted(start.rglob("*.py")) if start.is_dir() else [start]
+    inside = sorted(start.rglob("[!.]*.py")) if start.is_dir() else [start]
     left, seen, packages = list(inside), set(inside), set()
     while left:
         file = left.pop()
@@ -178,8 +178,10 @@ def runtime_imports(node: ast.AST) -> list[tuple[int, str]]:
 
 def test_mcl_copied_into_an_empty_folder_localizes(tmp_path: Path) -> None:
     blocks = dict(code_blocks(TAKE, "Localize in five lines"))
-    assert "{mcl,geometry}.py" in blocks["bash"] and "pip install numpy scipy numba" in blocks["bash"]
-    copy_files(["mcl.py", "geometry.py"], tmp_path)
+    assert (
+        "{mcl,compiled,geometry}.py" in blocks["bash"] and "pip install numpy scipy numba" in blocks["bash"]
+    )
+    copy_files(["mcl.py", "compiled.py", "geometry.py"], tmp_path)
     (tmp_path / "example.py").write_text(blocks["python"], encoding="utf-8")
     [printed] = run_examples([tmp_path], {"numpy", "scipy", "numba"})
     assert printed == blocks["text"]
@@ -228,7 +230,7 @@ def test_session_of_ones_own_is_read_as_oxfords_and_aligned(tmp_path: Path) -> N
 
 def test_names_in_the_list_of_symbols_stand_in_the_code() -> None:
     rows = re.findall(r"^\| \$.*$", (ROOT / "book" / "symbols.md").read_text(encoding="utf-8"), re.MULTILINE)
-    files = [*PACKAGE.glob("*.py"), *(ROOT / "notebooks").glob("0*.ipynb")]
+    files = [*PACKAGE.glob("[!.]*.py"), *(ROOT / "notebooks").glob("0*.ipynb")]
     words = {word for file in files for word in re.findall(r"\w+", file.read_text(encoding="utf-8"))}
     assert len(rows) > 40
     for row in rows:

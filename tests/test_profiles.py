@@ -54,13 +54,15 @@ def test_profile_names_rules_that_exist(name: str) -> None:
 @pytest.mark.parametrize("name", NAMES)
 def test_profile_asks_for_what_a_node_has(name: str) -> None:
     for rule, asked in requests(load_profile(name)).items():
-        assert set(asked) == {"mem_mb", "runtime"}, rule
+        assert set(asked) - {"gpu"} == {"mem_mb", "runtime"}, rule
         assert 1000 <= asked["mem_mb"] <= 64000
         assert 30 <= asked["runtime"] <= 7 * 24 * 60
 
 
 def test_profiles_ask_for_the_same() -> None:
-    assert requests(load_profile("slurm")) == requests(load_profile("kubernetes"))
+    kubernetes = load_profile("kubernetes")
+    assert kubernetes["default-resources"].pop("gpu") == 0  # its command needs a number
+    assert requests(load_profile("slurm")) == requests(kubernetes)
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -147,6 +149,7 @@ def given(submit: ModuleType) -> argparse.Namespace:
         "{threads}": "2",
         "{resources.mem_mb}": "8000",
         "{resources.runtime}": "90",
+        "{resources.gpu}": "0",
     }
     for name, value in values.items():
         assert name in command
@@ -165,8 +168,15 @@ def test_job_runs_its_script_on_the_volume(submit: ModuleType, given: argparse.N
     assert container["workingDir"] == "/volume/book"
     assert container["volumeMounts"] == [{"name": pod["volumes"][0]["name"], "mountPath": "/volume"}]
     assert container["resources"]["requests"] == {"cpu": "2", "memory": "8000M"}
+    assert container["resources"]["limits"] == {"memory": "8000M"}
     assert job["spec"]["activeDeadlineSeconds"] == 5400
     assert (pod["restartPolicy"], job["spec"]["backoffLimit"]) == ("Never", 0)
+
+
+def test_job_with_a_graphics_card_asks_for_it(submit: ModuleType, given: argparse.Namespace) -> None:
+    given.gpus = 1
+    container = submit.manifest(given, Path("/volume/book"))["spec"]["template"]["spec"]["containers"][0]
+    assert container["resources"]["limits"] == {"memory": "8000M", "nvidia.com/gpu": "1"}
 
 
 def test_job_off_the_volume_is_refused(submit: ModuleType, given: argparse.Namespace) -> None:

@@ -105,7 +105,7 @@ def test_scan_poses_come_with_the_project(tmp_path: Path, monkeypatch: pytest.Mo
     monkeypatch.chdir(Path(__file__).parents[1])
     shipped = rall.find_scan_poses(tmp_path)
     assert len(rall.load_scan_poses(shipped)) == 11
-    (tmp_path / rall.SCAN_POSES_PATH).write_text("timestamp_us,x_m,y_m,yaw_rad\n1,0,0,0\n")
+    (tmp_path / rall.SCAN_POSES_PATH).write_text("timestamp_us,x_m,y_m,yaw_rad\n1,0,0,0\n", encoding="utf-8")
     assert list(rall.load_scan_poses(rall.find_scan_poses(tmp_path))) == [1]
 
 

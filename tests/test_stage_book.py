@@ -2,6 +2,8 @@
 
 import base64
 import importlib.util
+import itertools
+import shutil
 import sys
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
@@ -9,8 +11,11 @@ from types import ModuleType, SimpleNamespace
 import nbformat
 import pytest
 import yaml
+from nbformat.v4 import new_notebook
 
+import chapters
 import stage_book
+import toolbox_pages
 from chapters import CHAPTERS, NOTEBOOKS, ChapterError
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -104,6 +109,30 @@ def test_binder_finds_what_the_button_needs() -> None:
     # With a folder of this name Binder would read that, and not the file.
     assert not (ROOT / "binder").exists() and not (ROOT / ".binder").exists()
     assert all((NOTEBOOKS / f"{chapter}.ipynb").is_file() for chapter in CHAPTERS)
+
+
+# ---- files that macOS leaves ----------------------------------------------------------------------------------
+
+
+def test_metadata_files_of_macos_are_passed_over(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    package, pages = tmp_path / "src/rol", tmp_path / "book"
+    shutil.copytree(chapters.PACKAGE, package, ignore=shutil.ignore_patterns("__pycache__"))
+    shutil.copytree(ROOT / "book", pages, ignore=shutil.ignore_patterns("__pycache__"))
+    for folder, kind in itertools.product(
+        (package, package / "virtual", pages, pages / "images"), ("md", "py")
+    ):
+        (folder / f"._x.{kind}").write_bytes(b"\0\5\x16\7\xff")
+    monkeypatch.chdir(tmp_path)
+    for module in (chapters, toolbox_pages):
+        monkeypatch.setattr(module, "PACKAGE", package)
+    monkeypatch.setattr(stage_book, "ROOT", tmp_path)
+    for name in ("stage_notebooks", "stage_result_figure"):
+        monkeypatch.setattr(stage_book, name, lambda *_: None)
+    monkeypatch.setattr(stage_book, "how_made_page", lambda *_: "")
+    staged = stage_book.stage(str(ROOT / "config/smoke.yaml"))
+    assert (staged / "toolbox/mcl.md").is_file() and (staged / "intro.md").is_file()
+    assert not list(staged.rglob("._*"))
+    assert chapters.stored_digest(new_notebook(), chapters.load_config(ROOT / "config/smoke.yaml"))
 
 
 # ---- the pages' own extension ---------------------------------------------------------------------------------

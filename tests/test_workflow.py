@@ -38,12 +38,12 @@ def workplace(tmp_path: Path) -> Path:
     (root / "python").symlink_to(sys.executable)
     (root / "stub/papermill").mkdir(parents=True)
     (root / "stub/papermill/__init__.py").touch()
-    (root / "stub/papermill/__main__.py").write_text(PAPERMILL)
+    (root / "stub/papermill/__main__.py").write_text(PAPERMILL, encoding="utf-8")
     config = chapters.load_config(ROOT / "config/smoke.yaml") | {"out_dir": str(root / "my results")}
-    (root / "mein Profil.yaml").write_text(yaml.safe_dump(config))
+    (root / "mein Profil.yaml").write_text(yaml.safe_dump(config), encoding="utf-8")
     pairs = root / "my results/pairs" / config["sessions"][0] / "pairs.json"
     pairs.parent.mkdir(parents=True)
-    pairs.write_text("{}")
+    pairs.write_text("{}", encoding="utf-8")
     return root
 
 
@@ -89,11 +89,13 @@ def test_training_continues_after_a_stop_and_starts_anew_after_a_change(workplac
     folder, log = workplace / "my results/pix2pix", workplace / "my results/logs/04_pix2pix.log"
     profile, told = workplace / "mein Profil.yaml", []
     for steps in (20, 20, 30):
-        profile.write_text(profile.read_text().replace("steps: 20", f"steps: {steps}"))
+        profile.write_text(
+            profile.read_text(encoding="utf-8").replace("steps: 20", f"steps: {steps}"), encoding="utf-8"
+        )
         (folder / "generator.safetensors").unlink(missing_ok=True)  # as after a stop
         answer = subprocess.run(train(workplace), check=False, **run)
         assert answer.returncode == 0, answer.stderr
-        told.append(log.read_text().splitlines())
+        told.append(log.read_text(encoding="utf-8").splitlines())
     assert [lines[1] for lines in told] == ["starts", "continues", "starts"]
     assert told[0][0] == f"python: {workplace / 'python'}"
     assert (folder / "checkpoint-before/last.safetensors").is_file()
@@ -119,7 +121,7 @@ def test_lock_is_waited_for_and_free_after_a_kill(
     assert second.poll() is None
     first.kill()
     assert second.stdout.readline() == "held\n"
-    assert f"process {second.pid}," in (tmp_path / ".snakemake/run.lock").read_text()
+    assert f"process {second.pid}," in (tmp_path / ".snakemake/run.lock").read_text(encoding="utf-8")
 
 
 @pytest.mark.slow

@@ -29,6 +29,7 @@ from chapters import CHAPTERS, ROOT, all_runs, code_cells, load_config, read_not
 RESULTS = {".csv", ".json", ".tum"}  # metrics, tables and trajectories
 NOT_RESULTS = {"logs", "notebooks"}  # folders of out_dir without results
 PROFILE = "https://w3id.org/ro/wfrun/process/0.5"  # Process Run Crate
+PROGRAM = re.compile(r"'[^']*/bin/([\w.-]+)'|\S*/bin/([\w.-]+)")  # a program of the environment, by its path
 START_PAGE = '<!doctype html><title>{title}</title><meta http-equiv="refresh" content="0; url={book}">'
 START_PAGE += '<a href="{book}">{title}</a>\n'
 
@@ -90,10 +91,11 @@ def parse_summary(table: str, profile: str) -> list[Job]:
         if status == "missing" or plan != "no update":
             faults.append((output, "missing" if status == "missing" else "out of date"))
             continue
-        command = re.sub(r"\S*/bin/python\S*", "python", command).partition(" > ")[0]
+        command = PROGRAM.sub(lambda found: found[1] or found[2], command).partition(" || {")[0]
         name = (rule, output if logs == "-" else logs)
         before = jobs[name].outputs if name in jobs else ()
-        jobs[name] = Job(rule, tuple(inputs.split(",")), (*before, output), command)
+        read = tuple(path for path in inputs.split(",") if path not in ("", "-"))
+        jobs[name] = Job(rule, read, (*before, output), command)
     if faults:
         more = f" (and {len(faults) - 1} more)" if faults[1:] else ""
         raise ArchiveError(
@@ -199,7 +201,7 @@ def add_action(crate: Any, files: Mapping[str, bytes], job: Job, made: list[str]
     """Add what one job did to a crate: its command, notebook, inputs, outputs and times."""
     from rocrate.model.contextentity import ContextEntity
 
-    notebook = re.search(r"-m papermill (\S+)", job.command)
+    notebook = re.search(r"-m papermill '?([^\s']+)", job.command)
     source = notebook[1] if notebook else "Snakefile"
     instrument = entity(crate, files, source)
     properties = {

@@ -334,7 +334,7 @@ def script_digest(name: str) -> str:
 
 def stored_digest(notebook: nbformat.NotebookNode, config: dict) -> str:
     """Give the digest that a stored notebook carries: its code, all of ``src/rol``, and the profile it was run with."""
-    package = [code_text(file.read_text(encoding="utf-8")) for file in sorted(PACKAGE.rglob("*.py"))]
+    package = [code_text(file.read_text(encoding="utf-8")) for file in sorted(PACKAGE.rglob("[!.]*.py"))]
     return digest([*code_cells(notebook), *package, json.dumps(config, sort_keys=True)])
 
 

@@ -201,7 +201,7 @@ def machine() -> dict[str, str]:
     from rol.pix2pix import has_bf16
 
     info = Path("/proc/cpuinfo")
-    models = re.findall(r"^model name\s*: (.+)$", info.read_text(), re.MULTILINE) if info.is_file() else []
+    models = re.findall(r"^model name\s*: (.+)$", read_text(info), re.MULTILINE) if info.is_file() else []
     installed = {package.name: package.version for package in importlib.metadata.distributions()}
     return {
         "Processor": models[0] if models else platform.processor() or platform.machine(),

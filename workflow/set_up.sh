@@ -3,30 +3,79 @@
 # does not count as done. PYTHON may name the interpreter.
 set -euo pipefail
 venv=$1 stamp=$2
-fitting='import ensurepip, sys; sys.exit(sys.version_info[:2] not in ((3, 11), (3, 12)))'
+workflow=$(dirname "$0")
+fitting='import ensurepip, sys; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 13))'
+export PYTHONUTF8=1 PIP_DISABLE_PIP_VERSION_CHECK=1 # UTF-8: pip writes the folder's name into scripts
+
+say() { echo "set-up: $*"; }
+fail() {
+    say "$@" >&2
+    exit 1
+}
+fits() { "$1" -c "$fitting" 2>/dev/null; }
 
 find_python() {
-    for python in ${PYTHON:-} python3.11 python3.12 python3 python; do
-        if "$python" -c "$fitting" 2>/dev/null; then
+    local python
+    if [ -n "${PYTHON:-}" ]; then
+        fits "$PYTHON" || fail "PYTHON=$PYTHON is no Python 3.11, 3.12 or 3.13 with venv"
+        echo "$PYTHON"
+        return
+    fi
+    for python in python3.11 python3.12 python3.13 python3 python; do
+        if fits "$python"; then
             echo "$python"
             return
         fi
     done
-    echo "set-up: no Python 3.11 or 3.12 (with venv) found; install one or name it: make PYTHON=... book" >&2
-    return 1
+    fetch_python
 }
 
-if ! "$venv/bin/python" -c "import pip; $fitting" 2>/dev/null; then
+# Let uv, installed by pip into an environment of its own, bring Python 3.13 into the folder of that environment.
+fetch_python() {
+    local own=$venv-python answer
+    say "no Python 3.11 to 3.13 with venv found; asking uv for Python 3.13" >&2
+    answer=$( (python3 -m venv --clear "$own" && "$own/bin/python" -m pip install -qq uv -c requirements.lock) 2>&1) ||
+        fail "a Python with venv is needed to install uv ($(last_line "$answer")); install one of Python 3.11 to 3.13: $(packages)"
+    export UV_PYTHON_INSTALL_DIR=$PWD/$own/python UV_HTTP_RETRIES=0
+    answer=$("$own/bin/uv" python install --no-progress 3.13 2>&1) ||
+        fail "uv cannot bring Python 3.13 ($(last_line "$answer")); install Python 3.11 to 3.13 or name it: make PYTHON=... book"
+    "$own/bin/uv" python find --managed-python 3.13
+}
+
+# Choose the build of PyTorch that fits the graphics card, if any; pip alone takes the CUDA libraries along on Linux.
+install_torch() {
+    local torch answer
+    torch=$(sed -n 's/^\(torch==[^ ;]*\).*/\1/p' requirements.lock)
+    if [ "$(uname)" != Linux ] || [[ $(installed torch) == "${torch#*==}"* ]]; then return; fi
+    "$venv/bin/python" -m pip install -qq uv -c requirements.lock
+    answer=$(UV_HTTP_TIMEOUT=20 UV_HTTP_RETRIES=0 "$venv/bin/uv" pip install --python "$venv/bin/python" --torch-backend=auto \
+        "$torch" -c requirements.lock 2>&1) ||
+        say "PyTorch comes by pip, with CUDA unless pip finds another build (uv: $(last_line "$answer"))"
+}
+
+installed() { "$venv/bin/python" -c "import importlib.metadata as m; print(m.version('$1'))" 2>/dev/null || true; }
+last_line() { tail -n 1 <<<"$1" | sed 's/^ *\(cause: \)\?//'; }
+packages() { echo "apt-get install $(paste -sd ' ' apt.txt), or dnf install $(paste -sd ' ' "$workflow/dnf.txt")"; }
+
+rm -f "$venv"/set-up-*
+# An environment with this file was left unfinished, and may hold half a package.
+unfinished=$venv/unfinished
+if [ -e "$unfinished" ] || ! "$venv/bin/python" -c "import pip; $fitting" 2>/dev/null; then
     python=$(find_python)
-    echo "set-up: $("$python" --version) into $venv"
+    say "$("$python" --version) into $venv"
     "$python" -m venv --clear "$venv"
 fi
-echo "set-up: installing requirements.lock into $venv (a few minutes the first time)"
-rm -f "$venv"/set-up-*
-pip() { "$venv/bin/python" -m pip --disable-pip-version-check "$@"; }
-pip install -qq -r requirements.lock
-pip install -qq --no-deps --no-build-isolation -e .
-pip check
+say "installing requirements.lock into $venv (a few minutes the first time)"
+touch "$unfinished"
+install_torch
+"$venv/bin/python" -m pip install -qq -r requirements.lock
+"$venv/bin/python" -m pip install -qq --no-deps --no-build-isolation -e .
+"$venv/bin/python" -m pip check
+rm "$unfinished"
+for module in numpy cv2 torch open3d; do
+    answer=$("$venv/bin/python" -c "import $module" 2>&1) ||
+        fail "$module cannot be imported: $(last_line "$answer"). The system's packages that are needed: $(packages)"
+done
 # Builds the font cache now; else the first chapter to draw would speak of it on stderr.
 "$venv/bin/python" -c 'import matplotlib.pyplot' 2>/dev/null
 touch "$stamp"

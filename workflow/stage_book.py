@@ -357,7 +357,7 @@ def stage(config_path: str) -> Path:
     config = load_config(config_path)
     book = Path(config["book_dir"])
     clear(book)
-    shutil.copytree(ROOT / "book", book, dirs_exist_ok=True)
+    shutil.copytree(ROOT / "book", book, ignore=shutil.ignore_patterns("._*"), dirs_exist_ok=True)
     stage_notebooks(config, book)
     stage_result_figure(config, book)
     modules = stage_toolbox(book)

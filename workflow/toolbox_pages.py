@@ -245,9 +245,9 @@ def index_page(files: list[Path]) -> str:
 
 def stage_toolbox(book: Path) -> list[str]:
     """Write a page for each module and their index; give the names of the pages."""
-    files = [file for file in sorted(PACKAGE.rglob("*.py")) if not file.name.startswith("__")]
+    files = [file for file in sorted(PACKAGE.rglob("[!.]*.py")) if not file.name.startswith("__")]
     files.sort(key=lambda file: (len(file.relative_to(PACKAGE).parts), file))
-    shutil.copytree(PACKAGE, book / "src" / "rol", ignore=shutil.ignore_patterns("__pycache__"))
+    shutil.copytree(PACKAGE, book / "src" / "rol", ignore=shutil.ignore_patterns("__pycache__", "._*"))
     examples = read_examples(book / "take.md")
     for file in files:
         example = examples.get(file.stem) if file.parent == PACKAGE else None

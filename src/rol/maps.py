@@ -24,7 +24,7 @@ except ImportError:  # this file was copied on its own
     from geometry import check_poses, compose, transform_points
 
 
-_WAITING_POINTS = 100_000  # fewest points that are added to a map at once
+_WAITING_POINTS = 50_000  # so many points are added to a map at once
 
 
 class MapError(ValueError):
@@ -81,7 +81,7 @@ def accumulate_map(
         2020, Sec. IV-A.
     """
     poses, n_clouds, waiting, n_waiting = check_poses(poses), 0, [], 0
-    cells, sums, hits = np.zeros((0, 2), dtype=np.int64), np.zeros((0, 2)), np.zeros(0)
+    cells = np.array([np.iinfo(np.int64).max]), np.zeros((1, 2)), np.zeros(1, dtype=np.int64)  # an end mark
     for i, cloud in enumerate(clouds):
         if i >= len(poses):
             raise MapError(f"more clouds than the {len(poses)} poses")
@@ -89,25 +89,31 @@ def accumulate_map(
             raise MapError(f"cloud {i} holds a point that is not finite")
         waiting.append(thin_points(transform_points(poses[i], np.reshape(cloud, (-1, 2))), cell)[0])
         n_clouds, n_waiting = n_clouds + 1, n_waiting + len(waiting[-1])
-        if n_waiting > max(len(cells), _WAITING_POINTS):  # memory grows with the map, not with the clouds
-            cells, sums, hits = _add_points(cells, sums, hits, np.concatenate(waiting), cell)
-            waiting, n_waiting = [], 0
+        if n_waiting > _WAITING_POINTS:  # memory grows with the map, not with the clouds
+            cells, waiting, n_waiting = _add_points(*cells, np.concatenate(waiting), cell), [], 0
     if n_clouds != len(poses):
         raise MapError(f"{n_clouds} clouds for {len(poses)} poses")
-    cells, sums, hits = _add_points(cells, sums, hits, np.concatenate([np.zeros((0, 2)), *waiting]), cell)
-    if not (hits >= min_hits).any():
+    _, sums, hits = _add_points(*cells, np.concatenate([np.zeros((0, 2)), *waiting]), cell)
+    is_kept = hits >= max(min_hits, 1)
+    if not is_kept.any():
         raise MapError(f"the map is empty: no cell is hit by {min_hits} of {len(poses)} clouds")
-    return (sums / hits[:, None])[hits >= min_hits]
+    return sums[is_kept] / hits[is_kept, None]
 
 
 def _add_points(
-    cells: np.ndarray, sums: np.ndarray, hits: np.ndarray, points: np.ndarray, cell: float
+    keys: np.ndarray, sums: np.ndarray, hits: np.ndarray, points: np.ndarray, cell: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Add points to the sums and numbers of points of their cells."""
-    known, inverse, _ = _unique_cells(np.concatenate([(cells + 0.5) * cell, points]), cell)
-    values, counts = np.concatenate([sums, points]), np.concatenate([hits, np.ones(len(points))])
-    sums = np.stack([np.bincount(inverse, values[:, k], len(known)) for k in range(2)], axis=1)
-    return known, sums, np.bincount(inverse, counts, len(known))
+    """Add points to the sums and numbers of points of their cells, which are sorted by key; the last is an end mark."""
+    indices = np.floor(points / cell).astype(np.int64)
+    own = (indices[:, 0] << 32) + indices[:, 1]
+    found = np.unique(own)
+    at = np.searchsorted(keys, found)
+    at, new = at[keys[at] != found], found[keys[at] != found]
+    keys, sums, hits = np.insert(keys, at, new), np.insert(sums, at, 0.0, axis=0), np.insert(hits, at, 0)
+    places = np.searchsorted(keys, own)
+    np.add.at(sums, places, points)
+    np.add.at(hits, places, 1)
+    return keys, sums, hits
 
 
 @dataclass(frozen=True)

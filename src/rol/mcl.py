@@ -12,11 +12,13 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numba import get_num_threads, njit, prange
+from numba import get_num_threads, prange
 
 try:
+    from .compiled import compiled
     from .geometry import check_poses, compose, wrap_angle
 except ImportError:  # this file was copied on its own
+    from compiled import compiled
     from geometry import check_poses, compose, wrap_angle
 
 
@@ -152,7 +154,7 @@ class MapGrid:
     best: int = 1
 
 
-@njit(cache=True)
+@compiled
 def _stamp(values: np.ndarray, points: np.ndarray, reach: float, codes: np.ndarray) -> None:
     """Raise, in place, cells nearer than the reach to a point [cells] to the code of their distance."""
     h, w = values.shape
@@ -283,7 +285,7 @@ def build_grid(map_points: np.ndarray, settings: MclSettings) -> MapGrid:
     return build_distance_grid(map_points, settings.sigma_m, settings.cell_m, settings.crowd_m)
 
 
-@njit(cache=True)
+@compiled
 def _sum_values(particles, points, values, x0, y0, cell):
     """Sum the grid's values under the points as seen from each particle.
 
@@ -311,7 +313,7 @@ def _sum_values(particles, points, values, x0, y0, cell):
     return sums
 
 
-@njit(cache=True, parallel=True)
+@compiled(parallel=True)
 def _sum_values_parallel(particles, points, values, x0, y0, cell, n_parts):
     """Do the same with the particles shared out in parts among all threads."""
     n = particles.shape[0]

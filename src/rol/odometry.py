@@ -14,11 +14,12 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 try:
+    from .compiled import compiled
     from .geometry import check_poses, compose, relative_pose, transform_points, wrap_angle
 except ImportError:  # this file was copied on its own
+    from compiled import compiled
     from geometry import check_poses, compose, relative_pose, transform_points, wrap_angle
 
 
@@ -436,13 +437,13 @@ def _choose(points: np.ndarray, n: int) -> np.ndarray:
 # and so on. Points far away cost no memory, and no point is missed.
 
 
-@njit(cache=True)
+@compiled
 def _to_cell(x):
     """Number of the 1 m cell along one axis; farther than any cloud reaches, all are the same."""
     return np.int64(np.floor(min(max(x, -1e15), 1e15)))
 
 
-@njit(cache=True)
+@compiled
 def _sort(points):
     """Sort points by cell: the sorted points, and where those of each cell start, shape (width^2 + 1,)."""
     width = 8
@@ -461,7 +462,7 @@ def _sort(points):
     return found, starts
 
 
-@njit(cache=True)
+@compiled
 def _count_around(target, enough):
     """Count the points in the circle, no further than enough of them."""
     points, _, (x, y, limit) = target
@@ -473,7 +474,7 @@ def _count_around(target, enough):
     return n
 
 
-@njit(cache=True)
+@compiled
 def _find_nearest(x, y, target, limit):
     """Find the point nearest to (x, y): its index and squared distance, (-1, limit) if none is below this limit.
 
@@ -504,7 +505,7 @@ def _find_nearest(x, y, target, limit):
     return nearest, limit
 
 
-@njit(cache=True)
+@compiled
 def _pair(pose, source, target, limit):
     """Move points and pair them: those with a neighbour, its index, and the squared distance."""
     moved, matched = np.empty_like(source), np.empty(len(source), np.int64)
@@ -518,7 +519,7 @@ def _pair(pose, source, target, limit):
     return moved[:n], matched[:n], squares[:n]
 
 
-@njit(cache=True)
+@compiled
 def _find_closest(squares, share):
     """Indices of the smallest values, a share of them."""
     n = int(np.ceil(share * len(squares)))
@@ -529,7 +530,7 @@ def _find_closest(squares, share):
     return np.concatenate((below, equal[: n - len(below)]))
 
 
-@njit(cache=True)
+@compiled
 def _fit_rigid(source, target, rows, matched):
     """Fit as `fit_rigid` does: row k of the source, of those in ``rows``, belongs to row ``matched[k]`` of the target.
 
@@ -552,7 +553,7 @@ def _fit_rigid(source, target, rows, matched):
     return (u - c * x + s * y, v - s * x - c * y, yaw), is_fixed
 
 
-@njit(cache=True)
+@compiled
 def _iterate_icp(source, target, pose, limits, stops):
     """Pair and fit in turns: what `IcpResult` holds, in its order."""
     limit, (trim, max_iterations, tolerance, min_matched) = limits[0], stops
@@ -576,7 +577,7 @@ def _iterate_icp(source, target, pose, limits, stops):
     return pose, 0, np.nan, 0, False, np.nan  # no iterations were allowed
 
 
-@njit(cache=True)
+@compiled
 def _weigh_directions(target, matched):
     """See `IcpResult.weakest_direction`; from at most 100 of the matched points."""
     total, even, slanted = 0.0, 0.0, 0.0  # xx + yy, xx - yy and 2 xy of the sum of the weights
@@ -593,7 +594,7 @@ def _weigh_directions(target, matched):
     return max((total - unequal) / (total + unequal), 0.0)
 
 
-@njit(cache=True)
+@compiled
 def _spread_about(target, centre, radius, most):
     """Number, variances and covariance (n, xx, yy, xy) of the nearest points within a radius, not many more than most."""
     near, n, x, y, xx, yy, xy = _find_near(target, centre, radius), 0, 0.0, 0.0, 0.0, 0.0, 0.0
@@ -606,7 +607,7 @@ def _spread_about(target, centre, radius, most):
     return n, xx / n - x * x, yy / n - y * y, xy / n - x * y
 
 
-@njit(cache=True)
+@compiled
 def _find_near(target, centre, radius):
     """Offsets and squared distances (u, v, square) of the points nearer than a radius, shape (n, 3)."""
     points, starts, _ = target
@@ -1051,7 +1052,7 @@ def _check_stamps(stamps_us: np.ndarray) -> np.ndarray:
     return stamps_us
 
 
-@njit(cache=True)
+@compiled
 def _line_metrics(cloud, radius, ratio, along_weight):
     """Weights of offsets from each point of a map, by the shape of its surroundings, shape (n, 2, 2)."""
     metrics = np.empty((len(cloud.points), 2, 2))
@@ -1066,7 +1067,7 @@ def _line_metrics(cloud, radius, ratio, along_weight):
     return metrics
 
 
-@njit(cache=True)
+@compiled
 def _sum_equations(pose, source, target, metrics, scales):
     """Sum the weighted normal equations of all pairs, within three times the first scale.
 

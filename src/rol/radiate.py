@@ -77,8 +77,8 @@ def load_pairs(real_root: Path | str) -> list[RadiatePair]:
     folder = Path(real_root) / PAIRS_PATH
     lidar_place = _load_lidar_place(Path(real_root) / CALIBRATION_PATH)
     scans, sweeps = (_load_times(folder / f"{name}.txt") for name in ("Navtech_Polar", "velo_lidar"))
-    radar_paths = sorted((folder / "Navtech_Polar").glob("*.png"))
-    lidar_paths = {path.stem: path for path in (folder / "velo_lidar").glob("*.csv")}
+    radar_paths = sorted((folder / "Navtech_Polar").glob("[!.]*.png"))
+    lidar_paths = {path.stem: path for path in (folder / "velo_lidar").glob("[!.]*.csv")}
     there = {number: seconds for number, seconds in sweeps.items() if number in lidar_paths}
     if not radar_paths or not there:
         raise RadiateError(f"{folder}: no scans or no sweeps with a time")

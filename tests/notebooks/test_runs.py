@@ -83,7 +83,7 @@ def test_every_real_scan_is_judged(profile: dict, real_root: Path) -> None:
 
 def test_every_output_of_the_codecheck_manifest_is_there(profile: dict) -> None:
     demo = load_config(ROOT / "config" / "demo.yaml")
-    for item in yaml.safe_load((ROOT / "codecheck.yml").read_text())["manifest"]:
+    for item in yaml.safe_load((ROOT / "codecheck.yml").read_text(encoding="utf-8"))["manifest"]:
         path = Path(item["file"].replace(demo["out_dir"], profile["out_dir"], 1))
         path = Path(str(path).replace(demo["book_dir"], profile["book_dir"], 1))
         if "make real" not in item["comment"] or find_real_root(profile.get("real_root", "")):

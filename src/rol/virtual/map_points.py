@@ -19,12 +19,14 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
 from scipy.spatial import cKDTree
 
 try:
+    from ..compiled import compiled
     from ..geometry import check_poses, invert, transform_points
 except ImportError:  # this file was copied on its own
+    from compiled import compiled
     from geometry import check_poses, invert, transform_points
 
 KINDS = ("near", "beside", "false")
@@ -144,7 +146,7 @@ def look_around(
     return Sight(np.rint(points).astype(np.int16), np.cumsum([0, *counts]))
 
 
-@njit(cache=True)
+@compiled
 def _cast(occupied, u0, v0, yaw, n_beams, reach, n_surfaces, depth):
     """Cells seen from one place, in its own frame and in cells, shape (k, 2)."""
     h, w = occupied.shape
@@ -177,7 +179,7 @@ def _cast(occupied, u0, v0, yaw, n_beams, reach, n_surfaces, depth):
     return points
 
 
-@njit(cache=True, parallel=True)
+@compiled(parallel=True)
 def _cast_all(occupied, places, n_beams, reach, n_surfaces, depth):
     """Do this from many places."""
     seen = [np.empty((0, 2))] * len(places)

@@ -13,8 +13,12 @@ from enum import IntEnum
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numba import njit
 from scipy.spatial import cKDTree
+
+try:
+    from ..compiled import compiled
+except ImportError:  # this file was copied on its own
+    from compiled import compiled
 
 if TYPE_CHECKING:
     from .mesh import Mesh
@@ -130,7 +134,7 @@ def _sort_into_cells(points: np.ndarray, side: float) -> tuple[np.ndarray, np.nd
     return order, cell_of, np.stack([starts[:-1], starts[1:]], axis=-1).reshape(*shape, 2)
 
 
-@njit(cache=True)
+@compiled
 def _count_strips(points, order, cell_of, starts, reach, half, n_ways):  # pragma: no cover (compiled)
     """Count, for each point and each of n directions over half a turn, the neighbours in a strip through it."""
     counts = np.ones((len(points), n_ways), dtype=np.int16)
@@ -154,7 +158,7 @@ def _count_strips(points, order, cell_of, starts, reach, half, n_ways):  # pragm
     return counts, n_near
 
 
-@njit(cache=True)
+@compiled
 def _fit_strips(points, order, cell_of, starts, reach, half, ways):  # pragma: no cover (compiled)
     """Fit a line to the neighbours in each point's strip: its heading [rad], and the point moved onto it."""
     headings, moved = ways.copy(), points.copy()

@@ -10,7 +10,11 @@ from __future__ import annotations
 from functools import lru_cache
 
 import numpy as np
-from numba import njit
+
+try:
+    from ..compiled import compiled
+except ImportError:  # this file was copied on its own
+    from compiled import compiled
 
 N_AZIMUTHS, N_BINS = 400, 3768
 RANGE_RESOLUTION, RANGE_OFFSET = 0.0438, -0.31  # true range = (bin + 0.5) * resolution + offset [m]
@@ -258,7 +262,7 @@ def _leakage_field() -> np.ndarray:
     return (size * smooth).astype(np.float32)
 
 
-@njit(cache=True, fastmath=True)
+@compiled(fastmath=True)
 def _splat(field, rows, bins, amplitudes, phases, response, pattern):  # pragma: no cover (compiled)
     n_rows, n_bins = field.shape[1], field.shape[2]
     for i in range(len(rows)):
@@ -282,7 +286,7 @@ def _splat(field, rows, bins, amplitudes, phases, response, pattern):  # pragma:
                 imaginaries[k] += weights[k] * imaginary
 
 
-@njit(cache=True)
+@compiled
 def _saturate(field, response):  # pragma: no cover (compiled)
     """Bend the receiver: a row's strongest echo is clipped and returns at 2, 3, 5, 7 times its bin."""
     n_rows, n_bins = field.shape[1], field.shape[2]
@@ -323,7 +327,7 @@ def _saturate(field, response):  # pragma: no cover (compiled)
                     field[1, row, centre + k] += weight * np.sin(order * phase)
 
 
-@njit(cache=True, fastmath=True)
+@compiled(fastmath=True)
 def _sum_blocks(field, energies):  # pragma: no cover (compiled)
     n_bins = field.shape[2]
     for row in range(energies.shape[0]):
@@ -334,7 +338,7 @@ def _sum_blocks(field, energies):  # pragma: no cover (compiled)
             energies[row, block] = total
 
 
-@njit(cache=True, fastmath=True)
+@compiled(fastmath=True)
 def _finish(field, white, floors, taps, table, codes):  # pragma: no cover (compiled)
     n_groups, n_bins, n_blocks = -(-codes.shape[1] // NOISE_STEP), codes.shape[1], floors.shape[1]
     noise = np.empty((2, n_groups * NOISE_STEP), dtype=np.float32)

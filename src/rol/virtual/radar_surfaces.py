@@ -9,7 +9,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
+
+try:
+    from ..compiled import compiled
+except ImportError:  # this file was copied on its own
+    from compiled import compiled
 
 CELL = 0.5  # grain of the world along a surface [m]: what a brick pier, a drain pipe, a window frame take up
 MOST_CELLS = 12  # cells that may answer between two neighbouring rays
@@ -92,7 +96,7 @@ def surface_table(changed: dict[str, Surface]) -> np.ndarray:
     return table
 
 
-@njit(cache=True)
+@compiled
 def scatter(
     points,
     directions,
@@ -185,7 +189,7 @@ def scatter(
     return turns[:count], ranges[:count], powers[:count], sources[:count]
 
 
-@njit(cache=True)
+@compiled
 def _step_aside(heading, total, dx, dy):  # pragma: no cover (compiled)
     """Turn and range of a place (dx, dy) beside the end of a way of given heading and length."""
     x, y = total * heading[0], total * heading[1]
@@ -193,7 +197,7 @@ def _step_aside(heading, total, dx, dy):  # pragma: no cover (compiled)
     return turn, np.sqrt((x + dx) ** 2 + (y + dy) ** 2 + (total * heading[2]) ** 2)
 
 
-@njit(cache=True)
+@compiled
 def _answer(surface, cosine, number, cell, z):  # pragma: no cover (compiled)
     """Backscatter of one cell of the world, as a share of a perfect scatterer's.
 
@@ -216,13 +220,13 @@ def _answer(surface, cosine, number, cell, z):  # pragma: no cover (compiled)
     return diffuse + specular + corner
 
 
-@njit(cache=True)
+@compiled
 def _hash_exponential(a, b, c, salt):  # pragma: no cover (compiled)
     """An exponential variate of mean 1, a function of its arguments alone."""
     return -np.log(1.0 - 0.9999 * _hash_unit(a, b, c, salt))
 
 
-@njit(cache=True)
+@compiled
 def _hash_unit(a, b, c, salt):  # pragma: no cover (compiled)
     """A number in [0, 1) that looks random but depends on nothing but its arguments."""
     h = (

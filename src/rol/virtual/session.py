@@ -437,7 +437,8 @@ def label_sweep(folder: Path | str, sensor: str, stamp_us: int) -> tuple[np.ndar
 def list_labels(folder: Path | str, sensor: str) -> np.ndarray:
     """List the sweeps of a virtual session whose true materials were written, shape (n,), int64 [us]."""
     return np.array(
-        sorted(int(path.stem) for path in (Path(folder) / "labels" / sensor).glob("*.png")), dtype=np.int64
+        sorted(int(path.stem) for path in (Path(folder) / "labels" / sensor).glob("[!.]*.png")),
+        dtype=np.int64,
     )
 
 

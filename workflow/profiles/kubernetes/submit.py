@@ -35,12 +35,13 @@ def manifest(given: argparse.Namespace, folder: Path) -> dict:
     if not folder.is_relative_to(given.mount):
         raise ValueError(f"{folder} does not lie on the volume, which is mounted at {given.mount}")
     resources = {"cpu": str(given.cores), "memory": f"{given.memory}M"}
+    gpus = {"nvidia.com/gpu": str(given.gpus)} if given.gpus else {}
     container = {
         "name": "job",
         "image": given.image,
         "command": ["sh", str(given.script)],
         "workingDir": str(folder),
-        "resources": {"requests": resources, "limits": {"memory": resources["memory"]}},
+        "resources": {"requests": resources, "limits": {"memory": resources["memory"], **gpus}},
         "volumeMounts": [{"name": "volume", "mountPath": str(given.mount)}],
     }
     volume = {"name": "volume", "persistentVolumeClaim": {"claimName": given.claim}}
@@ -71,6 +72,7 @@ def read_arguments(words: list[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--cores", required=True, type=int)
     parser.add_argument("--memory", required=True, type=int, help="in MB")
     parser.add_argument("--minutes", required=True, type=int, help="longest time that the job may take")
+    parser.add_argument("--gpus", type=int, default=0, help="graphics cards of NVIDIA; none if not given")
     parser.add_argument("script", type=Path, help="what the job runs")
     return parser.parse_args(words)
 
