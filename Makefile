@@ -43,7 +43,7 @@ test: $(STAMP) lint
 	@mkdir -p build/test
 	@$(PYTEST) -n $(CORES) --ignore=tests/notebooks | tee build/test/unit.log
 	@$(MAKE) --no-print-directory book PROFILE=smoke
-	@$(PYTEST) tests/notebooks | tee build/test/book.log
+	@$(PYTEST) -n $(CORES) --dist loadfile tests/notebooks | tee build/test/book.log
 	@echo
 	@echo "Tested: ruff on src, workflow, tests and notebooks;"
 	@echo "all chapters on the smoke profile by papermill ($$(find build/smoke/notebooks -name '*.ipynb' | wc -l) runs) and their book;"

@@ -32,6 +32,7 @@ TRAIN, LOCALIZE = SESSIONS[0], SESSIONS[1:]
 RUNS = chapters.all_runs(config)
 PARAMETERS = {run: chapters.run_parameters(config, run) for run in RUNS}  # a name that a notebook lacks ends here
 DIGESTS = {chapter: chapters.chapter_digest(NOTEBOOKS / f"{chapter}.ipynb") for chapter in chapters.CHAPTERS}
+TRANSLATION = chapters.translation(config)  # network and options of the generated images, those of chapter 05
 RECIPES = (config["virtual"] or {}).get("sessions", {})
 SHIPPED = [str(path) for path in sorted(Path("data/weights").glob("[!.]*.safetensors"))]  # networks that come with the book
 PYTHON, JUPYTER_BOOK = sys.executable, Path(sys.executable).with_name("jupyter-book")
@@ -182,6 +183,7 @@ rule ground_removal:
     output:
         notebook=executed("03_ground_removal"),
         pairs=OUT + "/pairs/{session}/pairs.json",
+        corrected=OUT + "/pairs-corrected/{session}/pairs.json",
     log:
         **logs("03_ground_removal"),
     params:
@@ -216,23 +218,44 @@ rule pix2pix:
         'mkdir -p "$kept"; echo "$run" > "$kept/run.txt"; fi; ' + PAPERMILL
 
 
+rule generated_images:
+    input:
+        pairs=OUT + "/pairs/{session}/pairs.json",
+        weights=TRANSLATION["weights"],
+    output:
+        OUT + "/fake/{session}/fake.json",
+    log:
+        OUT + "/logs/generated_images/{session}.log",
+    params:
+        pairs=OUT + "/pairs/{session}",
+        out=OUT + "/fake/{session}",
+        options=TRANSLATION["options"],
+        code=chapters.script_digest("generate_images.py"),
+    priority: 1
+    message:
+        "generated images, {wildcards.session}"
+    shell:
+        ENVIRONMENT + "OMP_NUM_THREADS={threads} {PYTHON:q} workflow/generate_images.py {params.pairs:q} {input.weights:q} "
+        "{params.out:q} --threads {threads} {params.options} > {log:q} 2>&1 || {{ tail -n 30 {log:q}; exit 1; }}"
+
+
 rule real_vs_fake:
     input:
         notebook=source("05_real_vs_fake"),
         pairs=expand(OUT + "/pairs/{session}/pairs.json", session=SESSIONS),
+        corrected=expand(OUT + "/pairs-corrected/{session}/pairs.json", session=LOCALIZE),
+        fake=expand(OUT + "/fake/{session}/fake.json", session=SESSIONS),
         weights=f"{OUT}/pix2pix/generator.safetensors",
         shipped=SHIPPED,
     output:
         notebook=executed("05_real_vs_fake"),
-        fake=expand(OUT + "/fake/{session}/fake.json", session=SESSIONS),
-        corrected=expand(OUT + "/fake-corrected/{session}/fake.json", session=LOCALIZE),
         similarity=expand(OUT + "/similarity/{session}.json", session=SESSIONS),
     log:
         **logs("05_real_vs_fake"),
     params:
         arguments=arguments("05_real_vs_fake"),
         code=DIGESTS["05_real_vs_fake"],
-    threads: 2
+    priority: 1
     message:
         "05 real against fake"
     shell:
@@ -264,7 +287,7 @@ rule localization:
     input:
         notebook=source("07_localization"),
         fake=OUT + "/fake/{session}/fake.json",
-        corrected=OUT + "/fake-corrected/{session}/fake.json",
+        corrected=OUT + "/pairs-corrected/{session}/pairs.json",
         summary=f"{OUT}/maps/summary.json",
         map=f"{OUT}/maps/{TRAIN}.npz",
         truth=OUT + "/ground_truth/{session}.tum",
@@ -313,6 +336,7 @@ rule oxford_route:
     params:
         arguments=arguments("09_oxford_route"),
         code=DIGESTS["09_oxford_route"],
+    priority: -1  # needs no other chapter, so it fills gaps
     message:
         "09 the real route"
     shell:
@@ -331,7 +355,6 @@ rule real_radar:
     params:
         arguments=arguments("10_real_radar"),
         code=DIGESTS["10_real_radar"],
-    threads: 2
     message:
         "10 real radar"
     shell:
@@ -350,6 +373,7 @@ rule ablations:
     params:
         arguments=arguments("11_ablations"),
         code=DIGESTS["11_ablations"],
+    priority: -1
     message:
         "11 ablations"
     shell:
@@ -367,6 +391,7 @@ rule performance:
     params:
         arguments=arguments("12_performance"),
         code=DIGESTS["12_performance"],
+    priority: -1
     message:
         "12 performance"
     shell:

@@ -1,5 +1,6 @@
 """Folders of fakes: made, gone on with, made anew for other settings, and refused when not whole."""
 
+import json
 from pathlib import Path
 
 import cv2
@@ -8,8 +9,11 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
+import generate_images
+from rol import fakes, pix2pix
 from rol.fakes import finish_fakes, list_fakes, prepare_fakes, read_image, write_fakes
-from rol.pix2pix import build_generator, generate
+from rol.pix2pix import build_generator, generate, save_weights
+from rol.radar import compensate_points
 
 pytestmark = pytest.mark.torch
 STAMPS = [1_000_000, 1_250_000, 1_500_000]
@@ -75,3 +79,90 @@ def test_unreadable_images_are_named(tmp_path: Path) -> None:
         (tmp_path / "bad.png").write_bytes(data)
         with pytest.raises(ValueError, match="bad.png: not a readable grey image"):
             read_image(tmp_path / "bad.png")
+
+
+# ---- a session at once ----------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def weights(tmp_path: Path, generator: torch.nn.Module) -> Path:
+    save_weights(tmp_path / "tiny.safetensors", generator, {"points": {"threshold": 100, "thin": False}})
+    return tmp_path / "tiny.safetensors"
+
+
+@pytest.fixture
+def session(pairs: Path) -> Path:
+    """The same pairs, complete."""
+    about = {"settings": {"motion": "none"}, "stamps_us": STAMPS}
+    (pairs / "pairs.json").write_text(json.dumps(about), encoding="utf-8")
+    return pairs
+
+
+def test_session_is_translated_and_left_alone_when_complete(
+    session: Path, weights: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = tmp_path / "fake"
+    assert list(fakes.translate_session(weights, session, folder)) == STAMPS
+    stamps_us, points = list_fakes(folder)
+    assert stamps_us == STAMPS and points["threshold"] == 100
+    for name in ("write_bytes", "write_text"):
+        monkeypatch.setattr(fakes, name, lambda path, data: pytest.fail(f"wrote {path}"))
+    assert list(fakes.translate_session(weights, session, folder)) == STAMPS
+
+
+def test_stopped_session_goes_on_and_other_pairs_start_anew(
+    session: Path, weights: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder, made = tmp_path / "fake", []
+    write = fakes.write_fakes
+    monkeypatch.setattr(
+        fakes, "write_fakes", lambda *words, **more: made.append(words[3]) or write(*words, **more)
+    )
+    stopped = fakes.translate_session(weights, session, folder)
+    next(stopped)
+    stopped.close()
+    assert list(fakes.translate_session(weights, session, folder)) == STAMPS
+    assert made == [[stamp] for stamp in STAMPS]
+    list(fakes.translate_session(weights, session, folder, threshold=120))
+    assert made == [[stamp] for stamp in STAMPS] and list_fakes(folder)[1]["threshold"] == 120
+    about = {"settings": {"motion": "corrected"}, "stamps_us": STAMPS}
+    (session / "pairs.json").write_text(json.dumps(about), encoding="utf-8")
+    list(fakes.translate_session(weights, session, folder))
+    assert made == [[stamp] for stamp in STAMPS] * 2
+
+
+def test_bf16_is_used_where_the_device_has_it(
+    session: Path, weights: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    used = []
+    monkeypatch.setattr(fakes, "write_fakes", lambda *words, bf16: used.append(bf16) or [words[3][0]])
+    monkeypatch.setattr(fakes, "finish_fakes", lambda *words: None)
+    for has, wanted in ((True, "auto"), (True, False), (False, "auto")):
+        monkeypatch.setattr(pix2pix, "has_bf16", lambda device, has=has: has)
+        list(fakes.translate_session(weights, session, tmp_path / "fake", bf16=wanted))
+    assert used == [True] * 3 + [False] * 6
+
+
+def test_points_are_moved_to_mid_scan_once(session: Path, weights: Path, tmp_path: Path) -> None:
+    folder, twists = tmp_path / "fake", [(10.0, 0.0, 0.1)] * 3
+    list(fakes.translate_session(weights, session, folder, threshold=1))
+    recorded = list(fakes.read_points(folder, STAMPS))
+    assert all(len(points) for points in recorded)
+    moved = list(fakes.read_points(folder, STAMPS, twists))
+    np.testing.assert_array_equal(moved[1], compensate_points(recorded[1], twists[1]))
+    assert np.abs(moved[1] - recorded[1]).max() > 0.1
+    about = json.loads((folder / "fake.json").read_text(encoding="utf-8"))
+    about["settings"]["pairs"]["motion"] = "corrected"  # the images are of mid-scan already
+    (folder / "fake.json").write_text(json.dumps(about), encoding="utf-8")
+    np.testing.assert_array_equal(list(fakes.read_points(folder, STAMPS, twists))[1], recorded[1])
+
+
+def test_script_generates_a_session_and_names_what_is_missing(
+    session: Path, weights: Path, tmp_path: Path, capsys: pytest.CaptureFixture
+) -> None:
+    given = [str(session), str(weights), str(tmp_path / "fake"), "--threshold", "90"]
+    assert generate_images.main(given) == 0
+    assert list_fakes(tmp_path / "fake") == (STAMPS, {"threshold": 90, "thin": False})
+    (session / "radar" / f"{STAMPS[0]}.png").unlink()
+    assert generate_images.main([*given[:2], str(tmp_path / "other")]) == 1
+    assert f"{STAMPS[0]}.png: the image is missing" in capsys.readouterr().err

@@ -202,6 +202,18 @@ def test_step_in_bfloat16_keeps_weights_in_full_precision() -> None:
     assert all(weight.dtype == torch.float32 for weight in networks[0].parameters())
 
 
+def test_padding_keeps_bfloat16() -> None:
+    image = torch.rand(1, 4, 16, 16, generator=seeded(1)).bfloat16()
+    pads = [
+        part
+        for part in build_generator(4, 1, rng=seeded(2)).modules()
+        if isinstance(part, nn.ReflectionPad2d)
+    ]
+    with torch.autocast("cpu", torch.bfloat16):
+        kinds = [pad(image).dtype for pad in pads]
+    assert kinds == [torch.bfloat16] * 4
+
+
 def test_bf16_is_chosen_by_the_processor_unless_it_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
     for there in (False, True):
         monkeypatch.setattr("rol.pix2pix.has_bf16", lambda device, there=there: there)

@@ -81,7 +81,8 @@ def test_plugin_of_the_executor_is_pinned(name: str) -> None:
 @pytest.mark.parametrize("name", NAMES)
 def test_profile_plans_all_jobs(name: str, tmp_path: Path) -> None:
     """All but the plugin's own options, since the plugin need not be installed."""
-    for folder in ("notebooks", "config", "book", "src", "workflow"):
+    for folder in ("notebooks", "config", "book", "src", "workflow", "data/weights"):
+        (tmp_path / folder).parent.mkdir(exist_ok=True)
         (tmp_path / folder).symlink_to(ROOT / folder)
     profile = load_profile(name)
     executor = profile.pop("executor")
@@ -107,8 +108,8 @@ def test_profile_plans_all_jobs(name: str, tmp_path: Path) -> None:
     plan = answer.stdout + answer.stderr
     runs = len(chapters.all_runs(chapters.load_config(ROOT / "config/smoke.yaml")))
     assert re.search(
-        rf"^total +{runs + 5 + 1}$", plan, flags=re.MULTILINE
-    )  # five sessions to make, and the book
+        rf"^total +{runs + 5 + 5 + 1}$", plan, flags=re.MULTILINE
+    )  # five sessions to make, their generated images, and the book
 
 
 def test_page_shows_the_profiles_as_they_are() -> None:

@@ -296,9 +296,32 @@ def snakemake(folder: Path, *words: str) -> subprocess.CompletedProcess:
 @pytest.fixture
 def workplace(tmp_path: Path) -> Path:
     """An empty folder that Snakemake takes for the root of the repository."""
-    for name in ("notebooks", "config", "book", "src", "workflow"):
+    for name in ("notebooks", "config", "book", "src", "workflow", "data/weights"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).symlink_to(ROOT / name)
     return tmp_path
+
+
+def test_generated_images_take_the_network_and_options_of_chapter_05() -> None:
+    config = chapters.load_config(ROOT / "config/smoke.yaml")
+    default = {"weights": "data/weights/rol.safetensors", "options": "--threshold=0 --device=cpu --bf16=auto"}
+    assert chapters.translation(config) == default
+    config["notebooks"]["05_real_vs_fake"] |= {"network": "chapter 04", "bf16": False, "device": "cuda"}
+    assert chapters.translation(config) == {
+        "weights": "build/smoke/pix2pix/generator.safetensors",
+        "options": "--threshold=0 --device=cuda --bf16=false",
+    }
+
+
+def test_network_of_chapter_04_is_trained_before_its_images_are_generated(workplace: Path) -> None:
+    config = chapters.load_config(ROOT / "config/smoke.yaml")
+    config["notebooks"]["05_real_vs_fake"] |= {"network": "chapter 04"}
+    (workplace / "own.yaml").write_text(yaml.safe_dump(config), encoding="utf-8")
+    made = "build/smoke/fake/virtual-town-seq01/fake.json"
+    answer = snakemake(workplace, "-n", "--quiet", "rules", "--configfile", "own.yaml", "--", made)
+    assert answer.returncode == 0, answer.stderr
+    plan = dict(re.findall(r"^(\w+) +(\d+)$", answer.stdout + answer.stderr, flags=re.MULTILINE))
+    assert plan["pix2pix"] == "1" and plan["generated_images"] == "1"
 
 
 def test_smoke_profile_plans_every_run(workplace: Path) -> None:
@@ -309,8 +332,9 @@ def test_smoke_profile_plans_every_run(workplace: Path) -> None:
         "virtual_session": "5",
         "alignment": "5",
         "ground_removal": "5",
+        "generated_images": "5",
         "localization": "4",
-        "total": "29",
+        "total": "34",
         **dict.fromkeys(("book", "sessions", "pix2pix", "real_vs_fake", "ground_truth", "results"), "1"),
         **dict.fromkeys(("oxford_route", "real_radar", "ablations", "performance"), "1"),
     }

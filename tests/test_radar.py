@@ -9,6 +9,7 @@ import pytest
 from rol import radar
 from rol.radar import (
     cfar_peaks,
+    compensate_points,
     doppler_shift,
     find_peaks,
     k_strongest_peaks,
@@ -283,6 +284,15 @@ def test_peaks_with_motion_meet_the_place():
         codes, AZIMUTHS, 1, 150, range_resolution=0.05, twist=twist, doppler_seconds=0.049
     )
     assert len(points) and np.linalg.norm(points.mean(axis=0) - place) < 0.25
+
+
+@pytest.mark.parametrize("place", [(30.0, 12.0), (-20.0, 5.0), (15.0, -25.0), (-4.0, -8.0)])
+def test_points_of_a_scan_as_recorded_move_to_their_place(place):
+    twist = (10.0, 0.3, 0.4)
+    recorded = k_strongest_peaks(simulate_dot(twist, place, 0.049), AZIMUTHS, 1, 150, range_resolution=0.05)
+    assert np.linalg.norm(recorded.mean(axis=0) - place) > 0.4
+    moved = compensate_points(recorded, twist, doppler_seconds=0.049)
+    assert np.linalg.norm(moved.mean(axis=0) - place) < 0.25
 
 
 def test_real_peaks_lie_on_the_real_map(real_root):

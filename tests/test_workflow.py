@@ -32,7 +32,7 @@ HOLD = "import sys, run_lock; run_lock.wait_for_lock(sys.argv[1], 'a.yaml'); pri
 def workplace(tmp_path: Path) -> Path:
     """A root of the repository, and an interpreter, below a folder whose name has a space, an umlaut and a quote."""
     root = tmp_path / "Käse 'Ordner"
-    for name in ("notebooks", "config", "book", "src", "workflow"):
+    for name in ("notebooks", "config", "book", "src", "workflow", "data/weights"):
         (root / name).parent.mkdir(exist_ok=True)
         (root / name).symlink_to(ROOT / name)
     (root / "python").symlink_to(sys.executable)

@@ -14,6 +14,7 @@ import shlex
 import tokenize
 from collections.abc import Iterable
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
 import nbformat
@@ -201,6 +202,25 @@ def run_parameters(config: dict, run: Run, notebooks: Path = NOTEBOOKS) -> dict:
     return {key: value for key, value in (common | own).items() if key in known}
 
 
+def translation(config: dict, notebooks: Path = NOTEBOOKS) -> dict[str, str]:
+    """Give the network that generates the images and the options of `generate_images.py`, as chapter 05 has them.
+
+    Returns
+    -------
+    translation : dict
+        ``weights``: file of the network; ``options``: arguments, quoted for the shell.
+    """
+    chapter = "05_real_vs_fake"
+    known = notebook_parameters(notebooks / f"{chapter}.ipynb") | run_parameters(
+        config, Run(chapter), notebooks
+    )
+    weights = Path(known["weights_root"], f"{known['network']}.safetensors")
+    if known["network"] == "chapter 04":
+        weights = Path(config["out_dir"], "pix2pix", "generator.safetensors")
+    options = [f"--{name}={str(known[name]).lower()}" for name in ("threshold", "device", "bf16")]
+    return {"weights": str(weights), "options": shlex.join(options)}
+
+
 def papermill_arguments(parameters: dict) -> str:
     """Write parameters as papermill's arguments, quoted for the shell.
 
@@ -218,6 +238,7 @@ def papermill_arguments(parameters: dict) -> str:
 # ---- digests --------------------------------------------------------------------------------------------------
 
 
+@cache  # chapters share most of their modules
 def code_text(source: str) -> str:
     """Reduce Python source to what can change a result: without comments, docstrings and blank lines."""
     lines = source.splitlines()
@@ -242,7 +263,8 @@ def code_cells(notebook: nbformat.NotebookNode) -> list[str]:
     ]
 
 
-def imported_modules(source: str, package: tuple[str, ...] = ()) -> set[tuple[str, ...]]:
+@cache
+def imported_modules(source: str, package: tuple[str, ...] = ()) -> frozenset[tuple[str, ...]]:
     """List the names below ``rol`` that a piece of source imports, as paths such as ``("virtual", "scene")``.
 
     Parameters
@@ -265,7 +287,7 @@ def imported_modules(source: str, package: tuple[str, ...] = ()) -> set[tuple[st
         else:
             continue
         found |= {name[1:] for name in names if name[:1] == ("rol",)}
-    return found
+    return frozenset(found)
 
 
 def module_files(sources: Iterable[str], package_root: Path = PACKAGE) -> list[Path]:
@@ -300,6 +322,14 @@ def virtual_digest() -> str:
     """Give the digest of all code that makes virtual sessions."""
     files = module_files(["import rol.virtual.__main__"])
     return digest(code_text(file.read_text(encoding="utf-8")) for file in files)
+
+
+def script_digest(name: str) -> str:
+    """Give the digest of a script of the workflow and of the modules it uses."""
+    script = (ROOT / "workflow" / name).read_text(encoding="utf-8")
+    return digest(
+        code_text(text) for text in [script, *(f.read_text(encoding="utf-8") for f in module_files([script]))]
+    )
 
 
 def stored_digest(notebook: nbformat.NotebookNode, config: dict) -> str:

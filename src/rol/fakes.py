@@ -7,6 +7,7 @@ Images are uint8 (h, w), 0 empty to 255 occupied, row 0 farthest forward, column
 
 from __future__ import annotations
 
+import hashlib
 import json
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -49,8 +50,70 @@ def prepare_fakes(folder: str | Path, settings: dict[str, Any]) -> set[int]:
     return prepare_images(folder, settings, (".",), "fake.json")
 
 
+def translate_session(
+    weights: str | Path,
+    pairs: str | Path,
+    folder: str | Path,
+    *,
+    threshold: int = 0,
+    device: str = "cpu",
+    bf16: bool | str = "auto",
+) -> Iterator[int]:
+    """Generate the lidar images of a session that are missing; a complete folder is not touched.
+
+    Parameters
+    ----------
+    weights : path
+        File of the network.
+    pairs : path
+        Folder of the pairs of the session.
+    folder : path
+        Folder of the generated images of the session. Images of another network or of other pairs are removed.
+    threshold : int
+        Smallest grey value that counts as a point, 1 to 255; 0 for the one that comes with the weights.
+    device : str
+        Where the network runs, "cpu" or "cuda".
+    bf16 : bool or "auto"
+        Whether to multiply in bfloat16, see `rol.pix2pix.choose_bf16`.
+
+    Yields
+    ------
+    stamp_us : int
+        Radar stamp of each image that is there, in the order of time [us].
+
+    Raises
+    ------
+    ValueError
+        If the weights or a radar image cannot be used; the message names the file.
+    """
+    from .front_ends import load_translator
+    from .pairs import list_pairs
+    from .pix2pix import choose_bf16
+
+    stamps_us = list_pairs(pairs)
+    described = json.loads((Path(pairs) / "pairs.json").read_text(encoding="utf-8"))["settings"]
+    translator = load_translator(weights)
+    points = translator.points | ({"threshold": threshold} if threshold else {})
+    checksum = hashlib.sha256(Path(weights).read_bytes()).hexdigest()
+    settings = {"weights": checksum, "bf16": bf16, "pairs": described}
+    whole = Path(folder) / "fake.json"
+    if whole.is_file() and whole.read_text(encoding="utf-8") == _describe_fakes(settings, stamps_us, points):
+        yield from stamps_us
+        return
+    there, fast = prepare_fakes(folder, settings), choose_bf16(bf16, device)
+    generator = translator.generator.to(device)
+    for stamp in stamps_us:
+        yield from [stamp] if stamp in there else write_fakes(generator, pairs, folder, [stamp], bf16=fast)
+    finish_fakes(folder, settings, stamps_us, points)
+
+
 def write_fakes(
-    generator: ResnetGenerator, pairs: str | Path, folder: str | Path, stamps_us: Sequence[int]
+    generator: ResnetGenerator,
+    pairs: str | Path,
+    folder: str | Path,
+    stamps_us: Sequence[int],
+    *,
+    bf16: bool = False,
 ) -> Iterator[int]:
     """Generate and save the fake lidar images of some scans, one after the other.
 
@@ -64,6 +127,8 @@ def write_fakes(
         Folder of the fakes of the session.
     stamps_us : sequence of int
         Radar stamps of the scans [us].
+    bf16 : bool
+        Multiply in bfloat16, see `rol.pix2pix.generate`.
 
     Yields
     ------
@@ -73,7 +138,8 @@ def write_fakes(
     from .pix2pix import generate
 
     for stamp in stamps_us:
-        fake = generate(generator, read_image(Path(pairs) / "radar" / f"{int(stamp)}.png"))
+        radar = read_image(Path(pairs) / "radar" / f"{int(stamp)}.png")
+        fake = generate(generator, radar, bf16=bf16)
         write_bytes(Path(folder) / f"{int(stamp)}.png", cv2.imencode(".png", fake)[1].tobytes())
         yield int(stamp)
 
@@ -103,9 +169,7 @@ def finish_fakes(
         path = Path(folder) / f"{int(stamp)}.png"
         if not path.is_file():
             raise ValueError(f"{path}: missing, the fakes are not complete")
-    stamps = [int(stamp) for stamp in stamps_us]
-    about = {"settings": settings, "points": points, "stamps_us": stamps}
-    write_text(Path(folder) / "fake.json", json.dumps(about, indent=1, sort_keys=True))
+    write_text(Path(folder) / "fake.json", _describe_fakes(settings, stamps_us, points))
 
 
 def list_fakes(folder: str | Path) -> tuple[list[int], dict[str, Any]]:
@@ -138,6 +202,44 @@ def list_fakes(folder: str | Path) -> tuple[list[int], dict[str, Any]]:
         raise ValueError(f"{path}: not a list of fakes ({error})") from error
 
 
+def read_points(
+    folder: str | Path, stamps_us: Sequence[int], twists: Sequence[Sequence[float]] | None = None
+) -> Iterator[np.ndarray]:
+    """Read the generated points of scans, one scan after the other.
+
+    Parameters
+    ----------
+    folder : path
+        Complete folder of the generated images of one session.
+    stamps_us : sequence of int
+        Radar stamps of the scans [us].
+    twists : sequence of (vx, vy, yaw rate), optional
+        Body velocity in each scan [m/s, m/s, rad/s]. With it points are moved to mid-scan, see
+        `rol.radar.compensate_points`; points of images that are motion-compensated already stay where they are.
+
+    Yields
+    ------
+    points : array, shape (n, 2)
+        Points in the radar frame [m].
+
+    Raises
+    ------
+    ValueError
+        If the folder is not complete or an image cannot be read; the message names the file.
+    """
+    from .bev import image_to_points
+    from .radar import compensate_points
+
+    folder = Path(folder)
+    how = list_fakes(folder)[1]
+    pairs = json.loads((folder / "fake.json").read_text(encoding="utf-8"))["settings"].get("pairs", {})
+    if twists is None or pairs.get("motion") == "corrected":
+        twists = [None] * len(stamps_us)
+    for stamp, twist in zip(stamps_us, twists, strict=True):
+        points = image_to_points(read_image(folder / f"{int(stamp)}.png"), **how)
+        yield points if twist is None else compensate_points(points, twist)
+
+
 def read_image(path: str | Path) -> np.ndarray:
     """Read a grey PNG.
 
@@ -164,3 +266,9 @@ def read_image(path: str | Path) -> np.ndarray:
     if image is None or image.ndim != 2 or image.dtype != np.uint8:
         raise ValueError(f"{path}: not a readable grey image of 8 bits")
     return image
+
+
+def _describe_fakes(settings: dict[str, Any], stamps_us: Sequence[int], points: dict[str, Any]) -> str:
+    """Put down what ``fake.json`` holds."""
+    about = {"settings": settings, "points": points, "stamps_us": [int(stamp) for stamp in stamps_us]}
+    return json.dumps(about, indent=1, sort_keys=True)

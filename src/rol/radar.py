@@ -198,6 +198,41 @@ def row_seconds(n_rows: int, scan_seconds: float = SCAN_SECONDS) -> np.ndarray:
     return (np.arange(n_rows) / n_rows - 0.5) * scan_seconds
 
 
+def compensate_points(
+    points: np.ndarray,
+    twist: np.ndarray | tuple[float, float, float],
+    *,
+    scan_seconds: float = SCAN_SECONDS,
+    doppler_seconds: float = DOPPLER_SECONDS,
+) -> np.ndarray:
+    """Move points found in a scan as recorded to where they are at mid-scan.
+
+    Parameters
+    ----------
+    points : array, shape (n, 2)
+        Points in the radar frame, each as it was seen when the beam passed it [m].
+    twist : array-like, shape (3,)
+        Constant body velocity (vx, vy, yaw rate) [m/s, m/s, rad/s].
+    scan_seconds, doppler_seconds : float
+        As in `polar_to_cartesian` [s].
+
+    Returns
+    -------
+    points : array, shape (n, 2)
+        Points in the radar frame at mid-scan, without motion and Doppler shift [m].
+
+    Notes
+    -----
+    A turn begins straight ahead and goes clockwise. Oxford's scans begin 0.8 deg later, which is 0.6 ms.
+    """
+    points = np.asarray(points, dtype=np.float64)
+    bearings, ranges = np.arctan2(points[:, 1], points[:, 0]), np.hypot(points[:, 0], points[:, 1])
+    ranges = ranges - doppler_shift(bearings, twist, doppler_seconds)
+    seconds = (np.mod(-bearings, 2.0 * np.pi) / (2.0 * np.pi) - 0.5) * scan_seconds
+    seen = np.stack([ranges * np.cos(bearings), ranges * np.sin(bearings)], axis=1)
+    return undistort_points(seen, seconds, twist)
+
+
 def find_peaks(
     codes: np.ndarray, k: int = 12, min_code: int = 60, min_bin: int = 0
 ) -> tuple[np.ndarray, np.ndarray]:

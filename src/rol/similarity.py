@@ -107,9 +107,24 @@ def similarity_summary(fake: np.ndarray, real: np.ndarray) -> dict[str, float | 
     -----
     Yin et al. 2020, Sec. IV-B report fake to real; the other direction shows what the fake cloud misses.
     """
-    summary: dict[str, float | int] = {"n_fake": len(fake), "n_real": len(real)}
-    for name, points, reference in (("fake_to_real", fake, real), ("real_to_fake", real, fake)):
-        distances = nn_distances(points, reference)
+    return summarize_distances(nn_distances(fake, real), nn_distances(real, fake))
+
+
+def summarize_distances(fake_to_real: np.ndarray, real_to_fake: np.ndarray) -> dict[str, float | int]:
+    """Summarize nearest-neighbour distances of both directions.
+
+    Parameters
+    ----------
+    fake_to_real, real_to_fake : array, shape (n,), (m,)
+        Distances of the points of one cloud to the other [m].
+
+    Returns
+    -------
+    summary : dict
+        As of `similarity_summary`.
+    """
+    summary: dict[str, float | int] = {"n_fake": len(fake_to_real), "n_real": len(real_to_fake)}
+    for name, distances in (("fake_to_real", fake_to_real), ("real_to_fake", real_to_fake)):
         summary[f"{name}_within_1m"] = share_within(distances, 1.0)
         summary[f"{name}_within_2m"] = share_within(distances, 2.0)
         summary[f"{name}_median_m"] = float(np.median(distances)) if len(distances) else float("nan")
