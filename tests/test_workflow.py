@@ -72,7 +72,7 @@ def train(root: Path, profile: str = "mein Profil.yaml", *words: str) -> list[st
 
 def environment(root: Path) -> dict[str, str]:
     """Give the environment in which the interpreter finds the stand-in first, with an ASCII locale."""
-    paths = [root / "stub", *(path for path in sys.path if "site-packages" in path)]
+    paths = [root / "stub", ROOT / "src", *(path for path in sys.path if "site-packages" in path)]
     return os.environ | {"PYTHONPATH": os.pathsep.join(map(str, paths)), "LC_ALL": "C"}
 
 
