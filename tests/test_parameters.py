@@ -30,6 +30,7 @@ real_root = ""
 seed = 1
 reach = 0.5
 bf16 = False
+fast = "auto"
 """
 
 
@@ -106,6 +107,7 @@ def test_faults_are_named(defaults: dict, changes: dict, message: str) -> None:
 def test_what_is_allowed(defaults: dict) -> None:
     check_parameters("x", defaults | {"reach": 1, "session": "all", "out_dir": "/nonexistent/out"})
     check_parameters("x", defaults | {"in_dir": "/nonexistent"}, optional=["in_dir"])
+    check_parameters("x", defaults | {"fast": False})
 
 
 def test_missing_parameters_and_notebooks_are_named(defaults: dict) -> None:

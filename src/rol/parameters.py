@@ -116,9 +116,12 @@ def _literal_names(namespace: MutableMapping[str, Any]) -> list[str]:
 
 
 def _type_fault(value: Any, default: Any) -> str:
-    """Describe what is wrong with the type of a value; empty if nothing is. A whole number passes for any number."""
+    """Describe what is wrong with the type of a value; empty if nothing is.
+
+    A whole number passes for any number; where the default is "auto", True and False pass too.
+    """
     kind = type(default)
-    accepted = (int, float) if kind is float else (kind,)
+    accepted = (int, float) if kind is float else (str, bool) if default == "auto" else (kind,)
     if type(value) not in accepted:
         hint = {str: "; papermill passes text by -r"}.get(kind, "")
         hint = "; papermill passes it by -p or -y, text by -r" if isinstance(value, str) else hint
