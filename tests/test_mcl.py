@@ -404,7 +404,7 @@ def test_more_clouds_than_steps_is_an_error():
 
 def test_the_file_works_copied_alone(tmp_path):
     source = Path(mcl.__file__).parent
-    for name in ("mcl.py", "geometry.py"):
+    for name in ("mcl.py", "compiled.py", "geometry.py"):
         shutil.copy(source / name, tmp_path)
     code = (
         "import numpy as np, mcl;"

@@ -136,7 +136,7 @@ def test_files_hold_what_was_done(tmp_path: Path) -> None:
     assert (about["session"], about["seed"], about["step"], about["pairs"]) == ("s", 1, 12, 5)
     assert about["config"]["lambda_l1"] == 100.0 and about["image_size"] == [32, 32]
     assert load_weights(tmp_path / "generator.safetensors").image_size == generator.image_size == (32, 32)
-    stored = pd.read_csv(tmp_path / "history.csv")
+    stored = pd.read_csv(tmp_path / "history.csv", float_precision="round_trip")
     pd.testing.assert_frame_equal(stored, history, check_exact=True)
     assert stored["held_out_l1"].isna().all()
     names = sorted(path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*") if path.is_file())
