@@ -1,5 +1,6 @@
 """Set-up: the lock for every Python, what the pages name, and set_up.sh with interpreters that only pretend."""
 
+import fcntl
 import importlib.metadata
 import itertools
 import json
@@ -129,6 +130,7 @@ case "$(basename "$0") $*" in
     if [ -e "$FAULTS/killed" ]; then kill -9 "$PPID"; exit 1; fi
     failing pip ;;
 *"import open3d"*) failing open3d ;;
+*fcntl*) exec "$REAL" "$@" ;;
 *"--version") echo "Python 3.x" ;;
 esac
 """
@@ -165,7 +167,12 @@ class Place:
         shutil.copy(ROOT / "apt.txt", self.root)
         (self.root / "requirements.lock").write_text("torch==1.2.3\nuv==1\n", encoding="utf-8")
         brought = folder / "brought-python"
-        self.environment = {"LOG": str(self.log), "FAULTS": str(self.faults), "BROUGHT": str(brought)}
+        self.environment = {
+            "LOG": str(self.log),
+            "FAULTS": str(self.faults),
+            "BROUGHT": str(brought),
+            "REAL": sys.executable,
+        }
         for path in (folder / "bin" / "python3", brought):
             path.write_text(PRETENDER, encoding="utf-8")
             path.chmod(0o755)
@@ -183,6 +190,13 @@ class Place:
     def fail(self, what: str, message: str = "") -> None:
         (self.faults / what).write_text(message, encoding="utf-8")
 
+    def start(self) -> subprocess.Popen:
+        """Start set_up.sh beside the test."""
+        command = ["workflow/set_up.sh", ".venv", ".venv/set-up-1"]
+        return subprocess.Popen(
+            command, cwd=self.root, env=self.environment, stdout=subprocess.PIPE, text=True
+        )
+
     @property
     def done(self) -> bool:
         return (self.root / ".venv/set-up-1").exists()
@@ -191,6 +205,18 @@ class Place:
 @pytest.fixture
 def place(tmp_path: Path) -> Place:
     return Place(tmp_path)
+
+
+def test_set_up_waits_for_another_one_and_takes_its_result(place: Place) -> None:
+    with (place.root / ".venv.lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        with place.start() as waiting:
+            assert "another set-up is at work" in waiting.stdout.readline()
+            (place.root / ".venv").mkdir()
+            (place.root / ".venv/set-up-1").touch()
+            fcntl.flock(lock, fcntl.LOCK_UN)
+    assert waiting.returncode == 0
+    assert not (place.root / ".venv/bin").exists()
 
 
 def test_set_up_asks_uv_for_torch_and_pip_for_the_rest(place: Place) -> None:

@@ -57,6 +57,18 @@ installed() { "$venv/bin/python" -c "import importlib.metadata as m; print(m.ver
 last_line() { tail -n 1 <<<"$1" | sed 's/^ *\(cause: \)\?//'; }
 packages() { echo "apt-get install $(paste -sd ' ' apt.txt), or dnf install $(paste -sd ' ' "$workflow/dnf.txt")"; }
 
+# One set-up at a time in one folder. The lock belongs to the open file, so it ends with this script, however that ends.
+lock() {
+    local python
+    python=$(command -v "${PYTHON:-python3}" || command -v python3.11 || command -v python3.12 || command -v python3.13) || return 0
+    exec 9>"$venv.lock"
+    "$python" -c 'import fcntl; fcntl.flock(9, fcntl.LOCK_EX | fcntl.LOCK_NB)' 2>/dev/null && return
+    say "another set-up is at work in $venv; waiting for it"
+    "$python" -c 'import fcntl; fcntl.flock(9, fcntl.LOCK_EX)'
+    if [ -e "$stamp" ]; then exit; fi
+}
+
+lock
 rm -f "$venv"/set-up-*
 # An environment with this file was left unfinished, and may hold half a package.
 unfinished=$venv/unfinished
