@@ -23,7 +23,7 @@ shift
 [ $# -gt 0 ] || set -- "make book PROFILE=smoke" "make test"
 clone=${CLONE:-radar-on-lidar}
 system=$(mktemp -d "${TMPDIR:-/tmp}/try_fresh-$suite.XXXXXX")
-trap 'rm -rf --one-file-system "$system"' EXIT
+trap 'rm -rf --one-file-system "$system" "$system.log"' EXIT
 chmod 755 "$system"
 
 # Run a command in the new system, as root unless options of chroot say otherwise. Mounts end with the command.
@@ -65,7 +65,6 @@ command -v debootstrap >/dev/null || DEBIAN_FRONTEND=noninteractive apt-get inst
 mirror=$(apt-get indextargets --format '$(LABEL) $(REPO_URI)' | sed -n 's/^Debian //p' | head -n 1)
 say "$suite from the host's mirror"
 debootstrap --variant=minbase "$suite" "$system" "${mirror:-}" >"$system.log" || { tail "$system.log"; fail "debootstrap failed"; }
-rm "$system.log"
 cp /etc/resolv.conf /etc/hosts "$system/etc/"
 apt-config dump | grep -E '^Acquire::(http|https|Check)' >"$system/etc/apt/apt.conf.d/99host" || true
 shared=
