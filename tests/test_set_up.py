@@ -122,13 +122,14 @@ failing() { if [ -e "$FAULTS/$1" ]; then cat "$FAULTS/$1" >&2; exit 1; fi; }
 case "$(basename "$0") $*" in
 *"python install"*) failing python-download ;;
 *"python find"*) echo "$BROUGHT" ;;
-"uv pip install"*) failing torch ;;
+"uv pip install"*torch-backend*) failing torch ;;
+"uv pip install"*)
+    if [ -e "$FAULTS/killed" ]; then kill -9 "$PPID"; exit 1; fi
+    failing uv-install; failing pip ;;
 *ensurepip*) if [ -n "${UNFIT:-}" ] && [[ $0 != *.venv/* && $0 != */brought-python ]]; then exit 1; fi ;;
 *"-m venv"*) mkdir -p "${*: -1}/bin"; cp "$0" "${*: -1}/bin/python" ;;
 *"pip install -qq uv"*) failing uv; cp "$0" "$(dirname "$0")/uv" ;;
-*"pip install -qq -r"*)
-    if [ -e "$FAULTS/killed" ]; then kill -9 "$PPID"; exit 1; fi
-    failing pip ;;
+*"pip install -qq -r"*) failing pip ;;
 *"import open3d"*) failing open3d ;;
 *fcntl*) exec "$REAL" "$@" ;;
 *"--version") echo "Python 3.x" ;;
@@ -219,7 +220,14 @@ def test_set_up_waits_for_another_one_and_takes_its_result(place: Place) -> None
     assert not (place.root / ".venv/bin").exists()
 
 
-def test_set_up_asks_uv_for_torch_and_pip_for_the_rest(place: Place) -> None:
+def test_pip_installs_what_uv_cannot_find(place: Place) -> None:
+    place.fail("uv-install", "error: no such index")
+    answer = place.set_up()
+    assert (answer.returncode, answer.stderr, place.done) == (0, "", True)
+    assert "python -m pip install -qq -r requirements.lock" in place.log.read_text(encoding="utf-8")
+
+
+def test_set_up_asks_uv_for_torch_and_then_for_the_rest(place: Place) -> None:
     answer = place.set_up()
     assert (answer.returncode, answer.stderr, place.done) == (0, "", True)
     steps = re.findall(

@@ -47,12 +47,13 @@ install_torch() {
     local torch answer
     torch=$(sed -n 's/^\(torch==[^ ;]*\).*/\1/p' requirements.lock)
     if [ "$(uname)" != Linux ] || [[ $(installed torch) == "${torch#*==}"* ]]; then return; fi
-    "$venv/bin/python" -m pip install -qq uv -c requirements.lock
-    answer=$(UV_HTTP_TIMEOUT=20 UV_HTTP_RETRIES=0 "$venv/bin/uv" pip install --python "$venv/bin/python" --torch-backend=auto \
-        "$torch" -c requirements.lock 2>&1) ||
-        say "PyTorch comes by pip, with CUDA unless pip finds another build (uv: $(last_line "$answer"))"
+    answer=$(by_uv --torch-backend=auto "$torch" -c requirements.lock 2>&1) && return
+    say "PyTorch comes by pip, with CUDA unless pip finds another build (uv: $(last_line "$answer"))"
+    by_pip "$torch" -c requirements.lock
 }
 
+by_pip() { "$venv/bin/python" -m pip install -qq "$@"; }
+by_uv() { UV_HTTP_TIMEOUT=20 UV_HTTP_RETRIES=0 "$venv/bin/uv" pip install --quiet --python "$venv/bin/python" "$@"; }
 installed() { "$venv/bin/python" -c "import importlib.metadata as m; print(m.version('$1'))" 2>/dev/null || true; }
 last_line() { tail -n 1 <<<"$1" | sed 's/^ *\(cause: \)\?//'; }
 packages() { echo "apt-get install $(paste -sd ' ' apt.txt), or dnf install $(paste -sd ' ' "$workflow/dnf.txt")"; }
@@ -79,9 +80,11 @@ if [ -e "$unfinished" ] || ! "$venv/bin/python" -c "import pip; $fitting" 2>/dev
 fi
 say "installing requirements.lock into $venv (a few minutes the first time)"
 touch "$unfinished"
+by_pip uv -c requirements.lock
 install_torch
-"$venv/bin/python" -m pip install -qq -r requirements.lock
-"$venv/bin/python" -m pip install -qq --no-deps --no-build-isolation -e .
+# uv takes half the time of pip, which in its turn knows indexes that uv has not been told of.
+by_uv --compile-bytecode -r requirements.lock 2>/dev/null || by_pip -r requirements.lock
+by_pip --no-deps --no-build-isolation -e .
 "$venv/bin/python" -m pip check
 rm "$unfinished"
 for module in numpy cv2 torch open3d; do
