@@ -118,7 +118,7 @@ class TrainingState:
                 states[index] = {"step": tensors[prefix + "step"], **moments}
             optimizer = self.optimizers[name]
             optimizer.load_state_dict({**optimizer.state_dict(), "state": states})
-        self.step, self.history, self.sums = found["step"], found["history"], found["sums"]
+        self.step, self.history, self.sums = found["step"], found["history"], found.get("sums", {})
 
 
 def learning_rate(step: int, n_steps: int, first: float) -> float:
@@ -237,7 +237,7 @@ def train(
     if resume and checkpoint.is_file():
         state.load(checkpoint, about)
     saved_s = monotonic()
-    while state.step < n_steps:
+    while state.step < n_steps or state.sums:  # sums: stopped before the last row was ended
         generator.train()
         try:
             for _ in _train_row(state, dataset, config, seed, loaders):
