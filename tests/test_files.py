@@ -59,6 +59,12 @@ def test_a_full_disk_is_named_and_leaves_no_file(
     assert not [path for path in tmp_path.rglob("*") if path.is_file()]
 
 
+def test_a_name_that_is_too_long_is_named(tmp_path: Path) -> None:
+    with pytest.raises(OSError, match="cannot write this file") as error:
+        files.write_text(tmp_path / f"{'x' * 250}.csv", "")
+    assert error.value.errno == errno.ENAMETOOLONG
+
+
 def test_a_file_that_is_there_survives_a_failed_write(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

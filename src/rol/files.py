@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import json
 import os
@@ -38,7 +39,7 @@ def write_bytes(path: Path | str, data: bytes) -> None:
         reason = "the disk is full" if error.errno in FULL else error.strerror
         raise OSError(error.errno, f"cannot write this file: {reason}", str(path)) from error
     finally:
-        if temporary.exists():
+        with contextlib.suppress(OSError):  # a second error would hide the first
             temporary.unlink()
 
 
