@@ -100,7 +100,7 @@ rule book:
         pages=[str(path) for path in sorted(Path("book").rglob("[!.]*")) if path.is_file()],
         modules=[str(path) for path in sorted(Path("src/rol").rglob("[!.]*.py"))],
         stage=["workflow/stage_book.py", "workflow/toolbox_pages.py", "workflow/check.py"],
-        reference=[str(path) for path in sorted(Path("data/reference").glob("*.json"))],
+        reference=[str(path) for path in sorted(Path("data/reference").glob("[!.]*.json"))],
     output:
         f"{BOOK}/_build/html/index.html",
     log:

@@ -55,7 +55,7 @@ install_torch() {
 by_pip() { "$venv/bin/python" -m pip install -qq "$@"; }
 by_uv() { UV_HTTP_TIMEOUT=20 UV_HTTP_RETRIES=0 "$venv/bin/uv" pip install --quiet --python "$venv/bin/python" "$@"; }
 installed() { "$venv/bin/python" -c "import importlib.metadata as m; print(m.version('$1'))" 2>/dev/null || true; }
-last_line() { tail -n 1 <<<"$1" | sed 's/^ *\(cause: \)\?//'; }
+last_line() { tail -n 1 <<<"$1" | sed 's/^ *//; s/^cause: //'; }
 packages() { echo "apt-get install $(paste -sd ' ' apt.txt), or dnf install $(paste -sd ' ' "$workflow/dnf.txt")"; }
 
 # One set-up at a time in one folder. The lock belongs to the open file, so it ends with this script, however that ends.
@@ -65,7 +65,8 @@ lock() {
     exec 9>"$venv.lock"
     "$python" -c 'import fcntl; fcntl.flock(9, fcntl.LOCK_EX | fcntl.LOCK_NB)' 2>/dev/null && return
     say "another set-up is at work in $venv; waiting for it"
-    "$python" -c 'import fcntl; fcntl.flock(9, fcntl.LOCK_EX)'
+    "$python" -c 'import fcntl; fcntl.flock(9, fcntl.LOCK_EX)' 2>/dev/null ||
+        say "this file system has no locks; start no second set-up in this folder"
     if [ -e "$stamp" ]; then exit; fi
 }
 

@@ -13,10 +13,8 @@ from typing import Any
 
 import numpy as np
 
-MAX_EXTENT_M, MAX_GRID_BYTES = (
-    1e5,
-    2**33,
-)  # a map beyond 100 km, a grid beyond 8 GiB: a stray point, most likely
+# Beyond these, a point is most likely stray.
+MAX_EXTENT_M, MAX_GRID_BYTES = 1e5, 2**33
 
 
 def wrap_angle(angle: np.ndarray | float) -> np.ndarray | float:
