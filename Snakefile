@@ -234,8 +234,12 @@ rule generated_images:
     priority: 1
     message:
         "generated images, {wildcards.session}"
-    shell:
-        ENVIRONMENT + "OMP_NUM_THREADS={threads} {PYTHON:q} workflow/generate_images.py {params.pairs:q} {input.weights:q} "
+    shell:  # continues with the images of a stopped run; those of other code are removed
+        'made={params.out:q}; [ "$(cat "$made.code" 2>/dev/null)" = {params.code} ] '
+        """|| ! grep -qs '"listing": "fake.json"' "$made/settings.json" """
+        """|| find "$made" -maxdepth 1 -name '[0-9]*.png' -delete; """
+        'echo {params.code} > "$made.code"; '
+        + ENVIRONMENT + "OMP_NUM_THREADS={threads} {PYTHON:q} workflow/generate_images.py {params.pairs:q} {input.weights:q} "
         "{params.out:q} --threads {threads} {params.options} > {log:q} 2>&1 || {{ tail -n 30 {log:q}; exit 1; }}"
 
 

@@ -101,6 +101,27 @@ def test_training_continues_after_a_stop_and_starts_anew_after_a_change(workplac
     assert (folder / "checkpoint-before/last.safetensors").is_file()
 
 
+@pytest.mark.slow
+def test_images_of_other_code_are_generated_anew(workplace: Path) -> None:
+    folder = workplace / "my results/fake" / chapters.load_config(ROOT / "config/smoke.yaml")["sessions"][0]
+    folder.mkdir(parents=True)
+    (folder / "settings.json").write_text('{"listing": "fake.json", "settings": {}}', encoding="utf-8")
+    command = [word if word != "pix2pix" else "generated_images" for word in train(workplace)[:-1]] + [
+        folder / "fake.json"
+    ]
+    there = []
+    for code in ("other", None):  # the job ends without images, since the pairs are none
+        (folder / "7.png").touch()
+        if code:
+            folder.with_name(f"{folder.name}.code").write_text(code, encoding="utf-8")
+        answer = subprocess.run(
+            command, check=False, cwd=workplace, env=environment(workplace), capture_output=True, text=True
+        )
+        assert "not a list of pairs" in answer.stdout + answer.stderr
+        there.append((folder / "7.png").exists())
+    assert there == [False, True]
+
+
 @pytest.mark.parametrize("profile", sorted((ROOT / "config").glob("*.yaml")), ids=lambda path: path.stem)
 def test_no_profile_trains_from_step_0_after_a_stop(profile: Path) -> None:
     run = chapters.Run("04_pix2pix")
