@@ -91,13 +91,13 @@ def translate_session(
     from .pix2pix import choose_bf16
 
     stamps_us = list_pairs(pairs)
-    described = json.loads((Path(pairs) / "pairs.json").read_text(encoding="utf-8"))["settings"]
+    described = json.loads(read_text(Path(pairs) / "pairs.json"))["settings"]
     translator = load_translator(weights)
     points = translator.points | ({"threshold": threshold} if threshold else {})
     checksum = hashlib.sha256(Path(weights).read_bytes()).hexdigest()
     settings = {"weights": checksum, "bf16": bf16, "pairs": described}
     whole = Path(folder) / "fake.json"
-    if whole.is_file() and whole.read_text(encoding="utf-8") == _describe_fakes(settings, stamps_us, points):
+    if whole.is_file() and read_text(whole) == _describe_fakes(settings, stamps_us, points):
         yield from stamps_us
         return
     there, fast = prepare_fakes(folder, settings), choose_bf16(bf16, device)
@@ -232,7 +232,7 @@ def read_points(
 
     folder = Path(folder)
     how = list_fakes(folder)[1]
-    pairs = json.loads((folder / "fake.json").read_text(encoding="utf-8"))["settings"].get("pairs", {})
+    pairs = json.loads(read_text(folder / "fake.json"))["settings"].get("pairs", {})
     if twists is None or pairs.get("motion") == "corrected":
         twists = [None] * len(stamps_us)
     for stamp, twist in zip(stamps_us, twists, strict=True):

@@ -12,12 +12,9 @@ import numpy as np
 
 try:
     from ..compiled import compiled
-except ImportError:  # this file was copied on its own
-    from compiled import compiled
-
-try:
     from ..geometry import check_fields
 except ImportError:  # this file was copied on its own
+    from compiled import compiled
     from geometry import check_fields
 
 CELL = 0.5  # grain of the world along a surface [m]: what a brick pier, a drain pipe, a window frame take up
