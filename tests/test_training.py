@@ -123,7 +123,10 @@ def test_checkpoints_by_time_within_a_row_lead_to_the_same_bits(
 
 
 def test_a_stop_between_the_last_step_and_its_row_keeps_the_row(tmp_path: Path) -> None:
-    config, settings = replace(TINY, report_every=5, checkpoint_every=10), {"seed": 3, "checkpoint_minutes": 0.0}
+    config, settings = (
+        replace(TINY, report_every=5, checkpoint_every=10),
+        {"seed": 3, "checkpoint_minutes": 0.0},
+    )
     whole = train(make_pairs(), config, tmp_path / "whole", **settings)[1]
 
     def stop(row: dict[str, float], _: object) -> None:
