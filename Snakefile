@@ -26,7 +26,7 @@ CONFIG_FILE = os.path.relpath(workflow.configfiles[-1])
 if workflow.is_main_process and not workflow.output_settings.dryrun:  # the Snakemake of a job is no main process
     run_lock.wait_for_lock(".snakemake/run.lock", CONFIG_FILE)
 chapters.check_config(config, CONFIG_FILE)
-SESSIONS_ROOT, OUT, BOOK = config["sessions_root"], config["out_dir"], config["book_dir"]
+SESSIONS_ROOT, OUT, BOOK = (os.path.normpath(config[key]) for key in ("sessions_root", "out_dir", "book_dir"))
 SESSIONS, METHODS = config["sessions"], config["methods"]
 TRAIN, LOCALIZE = SESSIONS[0], SESSIONS[1:]
 RUNS = chapters.all_runs(config)

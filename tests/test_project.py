@@ -313,8 +313,11 @@ def test_generated_images_take_the_network_and_options_of_chapter_05() -> None:
     }
 
 
-def test_network_of_chapter_04_is_trained_before_its_images_are_generated(workplace: Path) -> None:
-    config = chapters.load_config(ROOT / "config/smoke.yaml")
+@pytest.mark.parametrize("out_dir", ["build/smoke", "./build/smoke/"])
+def test_network_of_chapter_04_is_trained_before_its_images_are_generated(
+    workplace: Path, out_dir: str
+) -> None:
+    config = chapters.load_config(ROOT / "config/smoke.yaml") | {"out_dir": out_dir}
     config["notebooks"]["05_real_vs_fake"] |= {"network": "chapter 04"}
     (workplace / "own.yaml").write_text(yaml.safe_dump(config), encoding="utf-8")
     made = "build/smoke/fake/virtual-town-seq01/fake.json"
