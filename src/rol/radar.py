@@ -491,7 +491,7 @@ def _row_table(azimuths: np.ndarray, step: float) -> np.ndarray | None:
     """Tabulate the row of unevenly spaced azimuths at the rows of evenly spaced ones; None if all are even.
 
     Entry i belongs to row ``(i + 0.5) / TABLE_STEPS - 1`` of a scan with the same first azimuth and the mean step.
-    OpenCV rounds rows to 1/32, so the nearest entry suffices.
+    The nearest entry is off by at most half an entry, 1/128 of a row.
     """
     n, n_turn = len(azimuths), 2.0 * np.pi / step
     own = np.concatenate([azimuths[-1:] + 2.0 * np.pi, azimuths, azimuths[:1] - 2.0 * np.pi])
