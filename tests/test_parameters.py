@@ -83,6 +83,8 @@ def test_in_the_folder_of_the_notebooks_it_goes_to_the_root(
         ({"seed": True}, "seed: expected a whole number"),
         ({"reach": "far"}, "reach: expected a number such as 0.5, got 'far'"),
         ({"reach": float("nan")}, "reach: nan"),
+        ({"out_dir": ""}, "out_dir: must not be empty; its default is 'build/out'"),
+        ({"max_scans": 1}, "max_scans: one scan is no path; 0 uses all"),
         ({"n_runs": 0}, "n_runs: must be at least 1, got 0"),
         ({"max_scans": -1}, "max_scans: must not be negative, got -1"),
         ({"reach": -0.1}, "reach: must not be negative, got -0.1"),
@@ -194,3 +196,17 @@ def test_text_is_no_value_of_bf16() -> None:
         check_parameters(
             "10_real_radar", {**read_parameters(NOTEBOOKS / "10_real_radar.ipynb"), "bf16": "false"}
         )
+
+
+@pytest.mark.parametrize(
+    ("words", "fault"),
+    [
+        (["benchmarks/filter.py", "--rounds", "0"], "argument --rounds: invalid positive value: '0'"),
+        (["workflow/measure_route.py", "--jobs", "-1"], "argument --jobs: invalid positive value: '-1'"),
+        (["workflow/measure_route.py", "--only", "typo"], "--only: no table 'typo'; there are: seeds"),
+        (["workflow/generate_images.py", "a", "b", "c", "--device", "gpu"], "invalid choice: 'gpu'"),
+    ],
+)
+def test_command_lines_refuse_numbers_and_names_that_do_nothing(words: list[str], fault: str) -> None:
+    run = subprocess.run([sys.executable, *words], cwd=ROOT, capture_output=True, text=True, check=False)
+    assert run.returncode == 2 and fault in run.stderr

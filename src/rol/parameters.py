@@ -123,6 +123,19 @@ def read_parameters(path: Path | str) -> dict[str, Any]:
     raise ParameterError(f"{path}: has no cell tagged `parameters`")
 
 
+def positive(text: str) -> int:
+    """Read a whole number of at least 1, as ``type`` of an argument of `argparse`.
+
+    Raises
+    ------
+    ValueError
+        If the text is no such number.
+    """
+    if int(text) < 1:
+        raise ValueError
+    return int(text)
+
+
 def _literal_names(namespace: MutableMapping[str, Any]) -> list[str]:
     """List names of plain values that a person or papermill has set, without IPython's own."""
     kinds = (bool, int, float, str, list, dict, tuple, type(None))
@@ -160,6 +173,10 @@ def _range_fault(name: str, value: Any, default: Any) -> str:
     if name in CHOICES:
         known = ", ".join(map(repr, CHOICES[name]))
         return "" if value in CHOICES[name] else f"{value!r} is none of {known}"
+    if name == "max_scans" and value == 1:
+        return "one scan is no path; 0 uses all"
+    if value == "" != default:
+        return f"must not be empty; its default is {default!r}"
     if isinstance(default, (int, float)) and value < 0 <= default:
         return f"must not be negative, got {value}"
     is_count = type(default) is int and default > 0 and name not in MAY_BE_ZERO
