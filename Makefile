@@ -79,5 +79,9 @@ format: $(STAMP)
 	@$(BIN)/ruff format
 
 clean:
-	@rm -rf build .snakemake .pytest_cache .ruff_cache data/sessions/demo data/sessions/smoke data/sessions/route
+	@rm -rf build .snakemake .pytest_cache .ruff_cache
+	@for code in data/sessions/{demo,smoke,route}/*.code; do \
+	    made="$${code%.code}"; \
+	    if [ -f "$$code" ]; then rm -rf "$$made" "$$made.log" "$$code"; fi; \
+	done
 	@echo "Kept: .venv, data/real, data/sessions/weights, and sessions of your own."

@@ -32,6 +32,7 @@ from rol.front_ends import Translator, detect_points, load_translator, translate
 from rol.motion import MotionModel, mover
 from rol.odometry import local_map_odometry
 from rol.oxford import load_radar, load_timestamps
+from rol.parameters import positive
 from rol.pix2pix import ResnetGenerator, has_bf16
 
 NETWORKS = {"network rol, four headings": ("rol", None), "network rol, one heading": ("rol", 1),
@@ -115,8 +116,8 @@ def main() -> None:
     """Measure, print, and write the table."""
     parser = argparse.ArgumentParser(description="How fast the chain is, from the polar scan to the pose.")
     parser.add_argument("--real-root", default="", help="folder of the real data")
-    parser.add_argument("--rounds", type=int, default=2)
-    parser.add_argument("--threads", type=int, default=2)
+    parser.add_argument("--rounds", type=positive, default=2)
+    parser.add_argument("--threads", type=positive, default=2)
     given = parser.parse_args()
     torch.set_num_threads(given.threads)
     torch.manual_seed(1)

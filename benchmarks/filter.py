@@ -32,6 +32,7 @@ from rol import mcl, rall
 from rol.files import write_text
 from rol.geometry import invert, transform_points
 from rol.mcl import MapGrid
+from rol.parameters import positive
 
 CELLS = (0.5, 0.25, 0.125)  # sides of a cell [m]
 RANGE = 64.0  # of the translator's points [m]
@@ -216,7 +217,7 @@ def measure(
 def main() -> None:
     """Measure, print, and write the table."""
     parser = argparse.ArgumentParser(description="How fast the particle filter is, beside NumPy.")
-    parser.add_argument("--rounds", type=int, default=25)
+    parser.add_argument("--rounds", type=positive, default=25)
     parser.add_argument("--real-root", default="", help="folder of the real data")
     given = parser.parse_args()
     rng = np.random.default_rng(0)

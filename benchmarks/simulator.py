@@ -19,6 +19,7 @@ import numpy as np
 
 from rol import oxford, rall
 from rol.files import write_text
+from rol.parameters import positive
 from rol.virtual import radar_sensor, radar_signal
 from rol.virtual.session import VirtualSession, build_session, make_scan, make_sweep, sensor_settings
 from rol.virtual.settings import load_settings
@@ -75,7 +76,7 @@ def time_sweep(session: VirtualSession, index: int, folder: Path) -> dict[str, f
 def main() -> None:
     """Measure, print, and write the table."""
     parser = argparse.ArgumentParser(description="How fast virtual sensors are, and where the time goes.")
-    parser.add_argument("--scans", type=int, default=40)
+    parser.add_argument("--scans", type=positive, default=40)
     given = parser.parse_args()
     session, built_s = open_drive()
     indices = np.linspace(5, len(session.scans_us) - 5, given.scans).astype(int)

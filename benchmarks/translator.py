@@ -28,6 +28,7 @@ from scipy.ndimage import map_coordinates
 
 from rol.bev import image_to_points
 from rol.files import write_text
+from rol.parameters import positive
 from rol.pix2pix import TrainConfig, build_generator, generate, has_bf16, load_weights
 from rol.radar import polar_to_cartesian
 from rol.similarity import nn_distances
@@ -176,9 +177,9 @@ def describe_machine(threads: int) -> dict[str, object]:
 def main() -> None:
     """Measure, print, and write the table."""
     parser = argparse.ArgumentParser(description="How fast the translator is, beside the plain way.")
-    parser.add_argument("--rounds", type=int, default=7)
-    parser.add_argument("--threads", type=int, default=2)
-    parser.add_argument("--filters", type=int, default=64, help="width of the paper's network")
+    parser.add_argument("--rounds", type=positive, default=7)
+    parser.add_argument("--threads", type=positive, default=2)
+    parser.add_argument("--filters", type=positive, default=64, help="width of the paper's network")
     given = parser.parse_args()
     torch.set_num_threads(given.threads)
     image, rng = draw_image(np.random.default_rng(0)), torch.Generator().manual_seed(1)

@@ -1,5 +1,6 @@
 """The archive of a build, made from a tiny project and read back; and the files that describe the project."""
 
+import errno
 import json
 import os
 import re
@@ -193,11 +194,11 @@ def test_changed_code_is_refused_and_a_fault_leaves_no_part(
     pytest.importorskip("rocrate")
 
     def full(*_: object, **__: object) -> None:
-        raise OSError("No space left on device")
+        raise OSError(errno.ENOSPC, "No space left on device")
 
     with monkeypatch.context() as patch:
         patch.setattr(zipfile.ZipFile, "writestr", full)
-        with pytest.raises(OSError, match="No space left"):
+        with pytest.raises(OSError, match=r"cannot write this file: No space left on device: .*tiny\.zip'"):
             pack(project, CONFIG, summary())
     assert os.listdir(project / "build") == ["tiny"]
     (project / "README.md").write_text("changed", encoding="utf-8")

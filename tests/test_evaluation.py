@@ -257,6 +257,8 @@ def test_tum_round_trip(tmp_path):
             ["# t x y z", "1.0 0 0 0 0 0 0 1", "2.0 0 0 0 0 0 0 0"],
             "line 3: norm of the quaternion is 0, not 1",
         ),
+        (["1547131046353776 0 0 0 0 0 0 1"], "time 1547131046353776 cannot be in seconds"),
+        (["1.0000001 0 0 0 0 0 0 1", "1.0000002 0 0 0 0 0 0 1"], "times do not increase at pose 2"),
         (["1.0 0 0 0 0 0 0.5 0.5"], "line 1: norm of the quaternion is 0.707, not 1"),
         (["nan 0 0 0 0 0 0 1"], "pose 1 is not finite"),
     ],

@@ -157,6 +157,18 @@ def test_points_are_moved_to_mid_scan_once(session: Path, weights: Path, tmp_pat
     np.testing.assert_array_equal(list(fakes.read_points(folder, STAMPS, twists))[1], recorded[1])
 
 
+@pytest.mark.parametrize(
+    "content", ["{", '{"stamps_us": [1], "points": {}}', '{"stamps_us": [1], "settings": 3}']
+)
+def test_pairs_without_settings_are_named(content: str, weights: Path, tmp_path: Path) -> None:
+    (tmp_path / "pairs.json").write_text(content, encoding="utf-8")
+    (tmp_path / "fake.json").write_text(content.replace(": 3", ': 3, "points": {}'), encoding="utf-8")
+    with pytest.raises(ValueError, match="pairs.json: (holds no settings|not a list)"):
+        list(fakes.translate_session(weights, tmp_path, tmp_path / "fake"))
+    with pytest.raises(ValueError, match="fake.json: (holds no settings|not a list)"):
+        list(fakes.read_points(tmp_path, [1]))
+
+
 def test_script_generates_a_session_and_names_what_is_missing(
     session: Path, weights: Path, tmp_path: Path, capsys: pytest.CaptureFixture
 ) -> None:

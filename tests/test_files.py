@@ -139,6 +139,16 @@ def test_each_kind_of_folder_is_cleared_by_its_own_function_only(tmp_path: Path)
         prepare_fakes(tmp_path, {})
 
 
+def test_images_behind_a_symbolic_link_are_left_alone(tmp_path: Path) -> None:
+    prepare_pairs(tmp_path / "pairs", {"motion": "none"})
+    (tmp_path / "raw").mkdir()
+    (tmp_path / "raw" / "1.png").write_bytes(b"raw")
+    (tmp_path / "pairs" / "radar").symlink_to(tmp_path / "raw")
+    with pytest.raises(ValueError, match="radar: a symbolic link"):
+        prepare_pairs(tmp_path / "pairs", {"motion": "corrected"})
+    assert (tmp_path / "raw" / "1.png").read_bytes() == b"raw"
+
+
 def test_only_known_files_are_removed(tmp_path: Path) -> None:
     (tmp_path / ".DS_Store").touch()
     assert prepare_pairs(tmp_path, {"motion": "none"}) == set()
@@ -170,7 +180,9 @@ def calls_of(file: Path) -> list[tuple[str, ast.Call]]:
 def test_only_one_file_of_the_package_writes() -> None:
     """What all others write goes through it, so that the two tests on full disks hold for every writer."""
     direct = {"write_text", "write_bytes", "imwrite", "save_file", "savetxt"}
-    for file in sorted((ROOT / "src" / "rol").rglob("[!.]*.py")):
+    for file in sorted(
+        [*(ROOT / "src" / "rol").rglob("[!.]*.py"), *(ROOT / "notebooks").glob("[!.]*.ipynb")]
+    ):
         calls = [
             call for name, call in calls_of(file) if isinstance(call.func, ast.Attribute) and name in direct
         ]

@@ -122,3 +122,22 @@ def test_even_out_lets_a_front_count_by_its_length():
     assert abs(n_crowd - 100 / 11) <= 1.0  # the crowd together counts as one of eleven
     assert (drawn[:, None] == points[None]).all(axis=-1).any(axis=1).all()
     assert even_out(np.zeros((0, 2)), 2.0, rng).shape == (0, 2)
+
+
+@pytest.mark.torch
+@pytest.mark.parametrize(
+    ("header", "fault"),
+    [
+        ({"points": None}, "points is None, not a JSON object"),
+        ({"pairs_settings": [1]}, r"pairs_settings is \[1\], not a JSON object"),
+        ({"points": {"threshold": "high"}}, "points: threshold is 'high', known are"),
+        ({"points": {"radius": 3}}, "points: radius is 3, known are"),
+    ],
+)
+def test_header_with_other_points_is_refused(tmp_path: Path, header: dict, fault: str) -> None:
+    torch = pytest.importorskip("torch")
+    from rol.pix2pix import Pix2PixError, build_generator, save_weights
+
+    save_weights(tmp_path / "net.safetensors", build_generator(2, 1, rng=torch.Generator()), header)
+    with pytest.raises(Pix2PixError, match=f"net.safetensors: header: {fault}"):
+        front_ends.load_translator(tmp_path / "net.safetensors")

@@ -589,3 +589,24 @@ def test_follow_map_asks_for_a_step_to_each_cloud_and_for_a_map():
         list(follow_map([], [np.zeros((0, 2))] * 2, posts(), np.zeros(3)))
     with pytest.raises(OdometryError, match="map: expected points"):
         list(follow_map([], [np.zeros((0, 2))], np.zeros((3, 3)), np.zeros(3)))
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("max_distance", 0.0), ("max_distance", np.nan), ("min_distance", -1.0), ("trim", 0.0), ("trim", 1.5),
+        ("tolerance", -1.0), ("max_iterations", 0), ("min_matched", 0), ("max_points", 2.5),
+    ],
+)  # fmt: skip
+def test_icp_refuses_settings_out_of_range(name: str, value: float):
+    with pytest.raises(OdometryError, match=f"{name}: {value} is not"):
+        icp_2d(posts(), posts(), **{name: value})
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("reach", (-1.0, 1.0, 0.1)), ("reach", (1e6, 1.0, 0.1)), ("cell", 0), ("max_points", 0)],
+)
+def test_search_refuses_settings_out_of_range(name: str, value: float):
+    with pytest.raises(OdometryError, match=f"{name}: .* is not"):
+        search_motion(posts(), posts(), **{name: value})

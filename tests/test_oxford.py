@@ -736,6 +736,7 @@ def test_check_session_names_every_fault(session_root):
     shutil.copy(session_root / "radar" / f"{scans[0]}.png", session_root / "radar" / f"{scans[0] + 7}.png")
     (session_root / "radar" / f"{scans[2]}.png").write_bytes(b"")
     (session_root / "radar" / "notes.txt").write_text("x", encoding="utf-8")
+    (session_root / "radar" / f"._{scans[0]}.png").write_bytes(b"x")  # macOS puts it beside a file; no fault
     oxford.save_timestamps(session_root / "radar.timestamps", scans, scans != scans[3])
     keep = np.r_[0:4, 8:20]
     oxford.save_timestamps(session_root / "velodyne_left.timestamps", START + keep * 50_000)

@@ -31,6 +31,12 @@ seed = 1
 reach = 0.5
 bf16 = False
 fast = "auto"
+weights_root = "data/weights"
+network = "net"
+n_runs = 5
+max_scans = 0
+device = "cpu"
+low_m = -1.5
 """
 
 
@@ -40,7 +46,8 @@ def defaults(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> dict:
     cell = nbformat.v4.new_code_cell(PARAMETERS, metadata={"tags": ["parameters"]})
     for folder in ("notebooks", "data/sessions/one", "data/sessions/three", "build/in", "data/weights"):
         (tmp_path / folder).mkdir(parents=True)
-    (tmp_path / "data/weights/net.bin").touch()
+    for name in ("net.bin", "net.safetensors"):
+        (tmp_path / "data/weights" / name).touch()
     nbformat.write(nbformat.v4.new_notebook(cells=[cell]), tmp_path / "notebooks" / "x.ipynb")
     monkeypatch.chdir(tmp_path)
     return read_parameters("notebooks/x.ipynb")
@@ -76,6 +83,13 @@ def test_in_the_folder_of_the_notebooks_it_goes_to_the_root(
         ({"seed": True}, "seed: expected a whole number"),
         ({"reach": "far"}, "reach: expected a number such as 0.5, got 'far'"),
         ({"reach": float("nan")}, "reach: nan"),
+        ({"out_dir": ""}, "out_dir: must not be empty; its default is 'build/out'"),
+        ({"max_scans": 1}, "max_scans: one scan is no path; 0 uses all"),
+        ({"n_runs": 0}, "n_runs: must be at least 1, got 0"),
+        ({"max_scans": -1}, "max_scans: must not be negative, got -1"),
+        ({"reach": -0.1}, "reach: must not be negative, got -0.1"),
+        ({"device": "gpu"}, "device: 'gpu' is none of 'cpu', 'cuda'"),
+        ({"network": "nonsense"}, r"network: 'nonsense' has no file .*nonsense\.safetensors; there are: net"),
         ({"bf16": 1}, "bf16: expected True or False such as False, got 1"),
         ({"bf16": "True"}, "bf16: expected True or False"),
         ({"session": 2}, "session: expected text such as 'one', got 2; papermill passes text by -r"),
@@ -171,3 +185,28 @@ def test_profiles_pass_what_the_notebooks_accept(profile: Path, monkeypatch: pyt
             assert isinstance(namespace["session"], str)
             namespace["session"] = "all"
         check_parameters(run.chapter, namespace, optional=folders)
+
+
+def test_zero_means_something_for_a_seed_and_below_zero_for_a_height(defaults: dict) -> None:
+    check_parameters("x", {**defaults, "seed": 0, "low_m": -2.0, "network": "chapter 04"})
+
+
+def test_text_is_no_value_of_bf16() -> None:
+    with pytest.raises(ParameterError, match="bf16: 'false' is none of 'auto', True, False"):
+        check_parameters(
+            "10_real_radar", {**read_parameters(NOTEBOOKS / "10_real_radar.ipynb"), "bf16": "false"}
+        )
+
+
+@pytest.mark.parametrize(
+    ("words", "fault"),
+    [
+        (["benchmarks/filter.py", "--rounds", "0"], "argument --rounds: invalid positive value: '0'"),
+        (["workflow/measure_route.py", "--jobs", "-1"], "argument --jobs: invalid positive value: '-1'"),
+        (["workflow/measure_route.py", "--only", "typo"], "--only: no table 'typo'; there are: seeds"),
+        (["workflow/generate_images.py", "a", "b", "c", "--device", "gpu"], "invalid choice: 'gpu'"),
+    ],
+)
+def test_command_lines_refuse_numbers_and_names_that_do_nothing(words: list[str], fault: str) -> None:
+    run = subprocess.run([sys.executable, *words], cwd=ROOT, capture_output=True, text=True, check=False)
+    assert run.returncode == 2 and fault in run.stderr

@@ -402,6 +402,9 @@ HEADER = {"architecture": ARCHITECTURES["resnet"], "filters": 2, "blocks": 1, "i
         (json.dumps({**HEADER, "blocks": "1"}), "header: blocks is '1', expected a whole number"),
         (json.dumps({**HEADER, "headings": 1.5}), "header: headings is 1.5, expected a whole number"),
         (json.dumps({**HEADER, "image_size": 512}), "header: image_size is 512, expected two numbers"),
+        (json.dumps({**HEADER, "filters": 0}), "header: filters is 0, expected a whole number from 1"),
+        (json.dumps({**HEADER, "headings": 9}), "header: headings is 9, expected a whole number from 1 to 4"),
+        (json.dumps({**HEADER, "filters": 10**9}), "tensors do not fit the header's architecture"),
     ],
 )
 def test_broken_headers_are_named(tmp_path: Path, header: str, fault: str) -> None:
@@ -421,6 +424,15 @@ def test_weights_that_are_not_finite_are_neither_read_nor_written(tmp_path: Path
         save_weights(path, generator)
     save_file(contiguous(generator), path, {"rol": json.dumps(HEADER)})
     with pytest.raises(Pix2PixError, match=fault):
+        load_weights(path)
+
+
+@pytest.mark.parametrize("kind", [torch.int32, torch.bool, torch.float8_e4m3fn])
+def test_weights_of_another_type_are_refused(tmp_path: Path, kind: torch.dtype) -> None:
+    path = tmp_path / "g.safetensors"
+    tensors = {name: tensor.to(kind) for name, tensor in contiguous(tiny_generator()).items()}
+    save_file(tensors, path, {"rol": json.dumps(HEADER)})
+    with pytest.raises(Pix2PixError, match=f"g.safetensors: tensor .* is of {kind}, expected"):
         load_weights(path)
 
 

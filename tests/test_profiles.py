@@ -276,3 +276,28 @@ def test_binder_makes_a_session_of_the_demo() -> None:
     ).groups()
     demo = chapters.load_config(ROOT / config)
     assert demo["profile"] == "demo" and session == demo["sessions"][0] and out == demo["sessions_root"]
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "fault"),
+    [
+        ("profile: smoke", "profile: [", "not YAML"),
+        ("methods: [paper]", "methods: paper", "`methods` is no list of names"),
+        ("methods: [paper]", "methods: []", "`methods` is empty"),
+        ("book_dir: build/smoke/book", "book_dir: .", "`book_dir` names no folder of its own: '.'"),
+        ("out_dir: build/smoke", 'out_dir: ""', "`out_dir` names no folder of its own: ''"),
+    ],
+)
+def test_profiles_with_values_of_another_kind_are_named(
+    tmp_path: Path, old: str, new: str, fault: str
+) -> None:
+    text = (chapters.ROOT / "config/smoke.yaml").read_text(encoding="utf-8")
+    (tmp_path / "x.yaml").write_text(text.replace(old + "\n", new + "\n", 1), encoding="utf-8")
+    with pytest.raises(chapters.ChapterError, match=f"x.yaml: {fault}"):
+        chapters.load_config(tmp_path / "x.yaml")
+
+
+def test_an_empty_profile_is_named(tmp_path: Path) -> None:
+    (tmp_path / "x.yaml").touch()
+    with pytest.raises(chapters.ChapterError, match=r"x\.yaml: holds no keys"):
+        chapters.load_config(tmp_path / "x.yaml")

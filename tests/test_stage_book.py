@@ -41,7 +41,23 @@ def test_only_a_staged_book_is_removed(tmp_path: Path) -> None:
     (tmp_path / "made.md").rename(tmp_path / "thesis.md")
     with pytest.raises(ChapterError, match="holds files but no made.md"):
         stage_book.clear(tmp_path)
+    (tmp_path / "made.md").write_text("# How I made it", encoding="utf-8")
+    with pytest.raises(ChapterError, match="holds files but no made.md of this program"):
+        stage_book.clear(tmp_path)
     assert (tmp_path / "thesis.md").is_file()
+
+
+def test_links_are_neither_removed_nor_followed(tmp_path: Path) -> None:
+    staged, link = tmp_path / "staged", tmp_path / "link"
+    stage_book.clear(staged)
+    link.symlink_to(staged)
+    with pytest.raises(ChapterError, match="link: a symbolic link"):
+        stage_book.clear(link)
+    (staged / "made.md").rename(tmp_path / "own.md")
+    (staged / "own").symlink_to(tmp_path)
+    with pytest.raises(ChapterError, match="no made.md"):
+        stage_book.clear(staged)
+    assert (staged / "own").is_symlink()
 
 
 @pytest.fixture(scope="module")

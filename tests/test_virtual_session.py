@@ -325,9 +325,12 @@ def test_changed_settings_start_anew(folder: Path, tmp_path: Path) -> None:
     (tmp_path / "tiny.yaml").write_text(
         RECIPE.replace("scans: 4, seed: 2", "scans: 3, seed: 4"), encoding="utf-8"
     )
+    (copy / "gps").rename(tmp_path / "gps")
+    (copy / "gps").symlink_to(tmp_path / "gps")
     lines: list[str] = []
     writer.write_session(load_settings(tmp_path / "tiny.yaml"), NAME, tmp_path, lines.append)
     assert lines[0] == f"{NAME}: settings changed (session), starting anew"
+    assert (tmp_path / "gps" / "gps.csv").is_file() and not (copy / "gps").is_symlink()
     session = oxford.open_session(copy)
     assert other_faults(session) == [] and len(list((copy / "radar").iterdir())) == 3
     after, before = digests(copy), digests(folder)

@@ -277,6 +277,8 @@ def write_zip(path: Path, files: Mapping[str, bytes], executable: set[str], seco
                 info.external_attr = (0o100755 if name in executable else 0o100644) << 16
                 archive.writestr(info, files[name])
         part.replace(path)
+    except OSError as error:
+        raise OSError(error.errno, f"cannot write this file: {error.strerror}", str(path)) from error
     finally:
         part.unlink(missing_ok=True)
 

@@ -81,14 +81,29 @@ def load_config(path: str | Path) -> dict:
     ChapterError
         If a key is missing or nobody reads it, or a chapter named in it does not exist.
     """
-    return check_config(yaml.safe_load(read_text(path, ChapterError)), str(path))
+    try:
+        return check_config(yaml.safe_load(read_text(path, ChapterError)), str(path))
+    except yaml.YAMLError as error:
+        raise ChapterError(f"{path}: not YAML ({error})") from error
 
 
 def check_config(config: dict, name: str) -> dict:
-    """Check that a profile has every key that is needed and none that nobody reads."""
+    """Check that a profile has every key that is needed, of the right type, and none that nobody reads."""
+    if not isinstance(config, dict):
+        raise ChapterError(f"{name}: holds no keys")
     missing, unknown = CONFIG_KEYS - set(config), set(config) - CONFIG_KEYS - OPTIONAL_KEYS
     if missing or unknown:
         raise ChapterError(f"{name}: missing keys {sorted(missing)}, unknown keys {sorted(unknown)}")
+    for key in ("sessions", "methods"):
+        if not isinstance(config[key], list) or not all(
+            word and isinstance(word, str) for word in config[key]
+        ):
+            raise ChapterError(f"{name}: `{key}` is no list of names")
+    if not config["methods"]:
+        raise ChapterError(f"{name}: `methods` is empty")
+    for key in ("sessions_root", "out_dir", "book_dir"):
+        if not isinstance(config[key], str) or Path(config[key]) == Path("."):
+            raise ChapterError(f"{name}: `{key}` names no folder of its own: {config[key]!r}")
     strangers = set(config["notebooks"] or {}) - set(CHAPTERS)
     if strangers:
         raise ChapterError(f"{name}: no such chapters: {sorted(strangers)}")

@@ -13,6 +13,7 @@ import sys
 import torch
 
 from rol.fakes import translate_session
+from rol.parameters import positive
 
 BF16 = {"auto": "auto", "true": True, "false": False}
 
@@ -26,11 +27,13 @@ def read_arguments(words: list[str] | None = None) -> argparse.Namespace:
     parser.add_argument(
         "--threshold", type=int, default=0, help="grey value of a point; 0: that of the network"
     )
-    parser.add_argument("--device", default="cpu", help="cpu or cuda")
+    parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu", help="cpu or cuda")
     parser.add_argument(
         "--bf16", choices=BF16, default="auto", help="multiply in bfloat16; auto: where the device can"
     )
-    parser.add_argument("--threads", type=int, default=1, help="threads of the processor; 1 if not given")
+    parser.add_argument(
+        "--threads", type=positive, default=1, help="threads of the processor; 1 if not given"
+    )
     return parser.parse_args(words)
 
 

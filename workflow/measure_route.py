@@ -23,6 +23,7 @@ from rol.evaluation import consistency, pose_errors, summarize
 from rol.files import write_text
 from rol.mcl import MclSettings, settings_for
 from rol.motion import MotionModel
+from rol.parameters import positive
 from rol.rall import find_real_root
 from rol.recovery import RecoverySettings
 from rol.route import Route, RouteRun, list_routes
@@ -276,9 +277,11 @@ def main() -> None:
     """Measure what is asked for."""
     parser = argparse.ArgumentParser(description="Measure the filter on the real route.")
     parser.add_argument("--real-root", default="", help="folder of the real data")
-    parser.add_argument("--jobs", type=int, default=2, help="processes")
+    parser.add_argument("--jobs", type=positive, default=2, help="processes")
     parser.add_argument("--only", default=",".join(MEASURES), help="tables to make")
     given = parser.parse_args()
+    if unknown := set(given.only.split(",")) - set(MEASURES):
+        parser.error(f"--only: no table {min(unknown)!r}; there are: {', '.join(MEASURES)}")
     root = find_real_root(given.real_root)
     if root is None:
         raise SystemExit("the real map is not at hand: run `make real`, or give --real-root")

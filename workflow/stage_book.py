@@ -37,6 +37,7 @@ from rol.files import read_text, write_text
 from toolbox_pages import stage_toolbox
 
 FIGURE_DATA = ("session", "real", "simulated", "both")  # what a figure shows
+MADE_TITLE, STAGING = "# How this book was made", "# This book is being staged"  # first line of made.md
 GLUED_KIND = "{glue:text}`kind`"
 # The picture of the first page is taken from a run: the first of these that there is, and what the page says of it.
 RESULT_FIGURES = (
@@ -342,7 +343,7 @@ def how_made_page(config: dict, config_path: str) -> str:
         for metadata in [nbformat.read(run.path(config["out_dir"]), as_version=4).metadata]
     ]
     parts = [
-        "# How this book was made",
+        MADE_TITLE,
         markdown_table(["what", "this build"], rows),
         "## Time that each chapter took",
         markdown_table(["chapter", "session", "method", "s"], times),
@@ -353,13 +354,17 @@ def how_made_page(config: dict, config_path: str) -> str:
 
 
 def clear(book: Path) -> None:
-    """Remove a staged book; refuse a folder that holds files and is not a staged book."""
-    if not (book / "made.md").is_file() and any(path.is_file() for path in book.rglob("*")):
+    """Remove a staged book; refuse a folder that holds files or links and is not a staged book."""
+    made = book / "made.md"
+    is_staged = made.is_file() and made.read_bytes().startswith((MADE_TITLE.encode(), STAGING.encode()))
+    if not is_staged and any(path.is_file() or path.is_symlink() for path in book.rglob("*")):
         raise ChapterError(
-            f"book_dir: {book}: holds files but no made.md, so it is no staged book; left alone"
+            f"book_dir: {book}: holds files but no made.md of this program, so it is no staged book; left alone"
         )
+    if book.is_symlink():
+        raise ChapterError(f"book_dir: {book}: a symbolic link; name the folder itself")
     shutil.rmtree(book, ignore_errors=True)
-    write_text(book / "made.md", "")
+    write_text(made, STAGING)
 
 
 def stage(config_path: str) -> Path:

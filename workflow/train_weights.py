@@ -32,6 +32,7 @@ from rol.evaluation import read_tum
 from rol.files import read_text, write_text
 from rol.oxford import compose_odometry, load_radar_odometry, open_session
 from rol.pairs import estimate_twists, job_of_row
+from rol.parameters import positive
 from rol.scan_pairs import JoinedPairs, ScanPairs, gather_clouds
 
 DATA = Path(__file__).resolve().parents[1] / "data"
@@ -284,8 +285,8 @@ def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("recipe", type=Path)
     parser.add_argument("network", help="a network of the recipe, or 'ablations'")
-    parser.add_argument("--device", default="cpu")
-    parser.add_argument("--threads", type=int, default=2)
+    parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu")
+    parser.add_argument("--threads", type=positive, default=2)
     parser.add_argument(
         "--judge", action="store_true", help="train nothing, judge the weights that are there"
     )

@@ -423,7 +423,7 @@ def read_tum(path: Path | str) -> tuple[np.ndarray, np.ndarray]:
     ------
     EvaluationError
         If a line does not have eight numbers, a quaternion is not a unit quaternion (within 0.01), a value is
-        not finite, or times do not increase.
+        not finite, times do not increase by 1 us or more, or they are not seconds.
     """
     rows = []
     for number, line in enumerate(read_text(path, EvaluationError).splitlines(), start=1):
@@ -441,7 +441,11 @@ def read_tum(path: Path | str) -> tuple[np.ndarray, np.ndarray]:
     poses = np.stack([table[:, 1], table[:, 2], 2.0 * np.arctan2(table[:, 6], table[:, 7])], axis=1)
     poses[:, 2] = (poses[:, 2] + np.pi) % (2.0 * np.pi) - np.pi
     _check_trajectory(path, table[:, 0], poses)
-    return np.round(table[:, 0] * 1e6).astype(np.int64), poses
+    if np.abs(table[:, 0]).max() > 1e11:  # 3000 years; today's time in ms is above that
+        raise EvaluationError(f"{path}: time {table[:, 0].max():.0f} cannot be in seconds")
+    stamps_us = np.round(table[:, 0] * 1e6).astype(np.int64)
+    _check_trajectory(path, stamps_us, poses)
+    return stamps_us, poses
 
 
 METRICS = {

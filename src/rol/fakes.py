@@ -91,13 +91,13 @@ def translate_session(
     from .pix2pix import choose_bf16
 
     stamps_us = list_pairs(pairs)
-    described = json.loads(read_text(Path(pairs) / "pairs.json"))["settings"]
+    described = _read_settings(Path(pairs) / "pairs.json")
     translator = load_translator(weights)
     points = translator.points | ({"threshold": threshold} if threshold else {})
     checksum = hashlib.sha256(Path(weights).read_bytes()).hexdigest()
     settings = {"weights": checksum, "bf16": bf16, "pairs": described}
     whole = Path(folder) / "fake.json"
-    if whole.is_file() and read_text(whole) == _describe_fakes(settings, stamps_us, points):
+    if whole.is_file() and whole.read_bytes() == _describe_fakes(settings, stamps_us, points).encode():
         yield from stamps_us
         return
     there, fast = prepare_fakes(folder, settings), choose_bf16(bf16, device)
@@ -232,7 +232,7 @@ def read_points(
 
     folder = Path(folder)
     how = list_fakes(folder)[1]
-    pairs = json.loads(read_text(folder / "fake.json"))["settings"].get("pairs", {})
+    pairs = _read_settings(folder / "fake.json").get("pairs", {})
     if twists is None or pairs.get("motion") == "corrected":
         twists = [None] * len(stamps_us)
     for stamp, twist in zip(stamps_us, twists, strict=True):
@@ -266,6 +266,14 @@ def read_image(path: str | Path) -> np.ndarray:
     if image is None or image.ndim != 2 or image.dtype != np.uint8:
         raise ValueError(f"{path}: not a readable grey image of 8 bits")
     return image
+
+
+def _read_settings(path: Path) -> dict[str, Any]:
+    """Read the settings that a ``pairs.json`` or ``fake.json`` holds."""
+    try:
+        return dict(json.loads(read_text(path))["settings"])
+    except (ValueError, KeyError, TypeError) as error:
+        raise ValueError(f"{path}: holds no settings ({error})") from error
 
 
 def _describe_fakes(settings: dict[str, Any], stamps_us: Sequence[int], points: dict[str, Any]) -> str:

@@ -106,7 +106,8 @@ def prepare_images(
     Raises
     ------
     ValueError
-        If the folder is not empty and has no such ``settings.json``. It is left as it is.
+        If the folder is not empty and has no such ``settings.json``, or images with other settings lie behind a
+        symbolic link. It is left as it is.
     """
     folder = Path(folder)
     marker, wanted = folder / "settings.json", {"listing": listing, "settings": settings}
@@ -116,6 +117,9 @@ def prepare_images(
             f"{folder}: not empty, and not made for {listing} (no settings.json that says so); nothing was"
             " removed. Choose another folder, or delete this one if its content is not needed"
         )
+    is_other = found != json.loads(json.dumps(wanted))
+    for linked in (folder / name for name in subfolders if is_other and (folder / name).is_symlink()):
+        raise ValueError(f"{linked}: a symbolic link; the images of other settings in it were not removed")
     (folder / listing).unlink(missing_ok=True)
     for leftover in (path for name in subfolders for path in (folder / name).glob(".*.png.*.tmp")):
         leftover.unlink()  # of a run that was killed
@@ -123,7 +127,7 @@ def prepare_images(
         {path.stem: path for path in (folder / name).glob("*.png") if path.stem.isdecimal()}
         for name in subfolders
     ]
-    if found != json.loads(json.dumps(wanted)):
+    if is_other:
         for path in (path for there in images for path in there.values()):
             path.unlink()
         write_text(marker, json.dumps(wanted, indent=1, sort_keys=True))

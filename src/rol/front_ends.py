@@ -64,12 +64,19 @@ def load_translator(path: str | Path) -> Translator:
     Raises
     ------
     rol.pix2pix.Pix2PixError
-        If the file is missing, not whole, or of another architecture.
+        If the file is missing, not whole, of another architecture, or its header has other ``points`` or
+        ``pairs_settings`` than these.
     """
-    from .pix2pix import load_metadata, load_weights
+    from .pix2pix import Pix2PixError, load_metadata, load_weights
 
-    about = load_metadata(path)
-    points = {"threshold": 128, "thin": False, **about.get("points", {})}
+    about, defaults = load_metadata(path), {"threshold": 128, "thin": False}
+    for name in ("points", "pairs_settings"):
+        if not isinstance(about.get(name, {}), dict):
+            raise Pix2PixError(f"{path}: header: {name} is {about[name]!r:.60}, not a JSON object")
+    points = {**defaults, **about.get("points", {})}
+    for name, value in points.items():
+        if type(value) is not type(defaults.get(name)):
+            raise Pix2PixError(f"{path}: header: points: {name} is {value!r:.60}, known are {defaults}")
     return Translator(load_weights(path), points, dict(about.get("pairs_settings", {})), about)
 
 

@@ -89,9 +89,22 @@ def check_fields(
             if isinstance(span, tuple):
                 if value not in span:
                     raise error(f"{name}: {value!r} is none of {', '.join(span)}")
-            elif not _is_in(value, span, kinds[name] == "int"):
-                kind = "a whole number in " if kinds[name] == "int" else "in "
-                raise error(f"{name}: {value} is not {kind}{span}")
+            else:
+                check_number(name, value, span, kinds[name] == "int", error)
+
+
+def check_number(
+    name: str, value: Any, span: str, is_whole: bool = False, error: type[ValueError] = ValueError
+) -> None:
+    """Check that a number, or each number of nested tuples, lies in an interval such as "[0, 1)".
+
+    Raises
+    ------
+    ValueError
+        Or the given ``error``, with the name, the value and the interval; NaN is in no interval.
+    """
+    if not _is_in(value, span, is_whole):
+        raise error(f"{name}: {value} is not {'a whole number in ' if is_whole else 'in '}{span}")
 
 
 def _is_in(value: Any, span: str, is_whole: bool) -> bool:

@@ -17,10 +17,26 @@ import numpy as np
 
 try:
     from .compiled import compiled
-    from .geometry import check_fields, check_poses, compose, relative_pose, transform_points, wrap_angle
+    from .geometry import (
+        check_fields,
+        check_number,
+        check_poses,
+        compose,
+        relative_pose,
+        transform_points,
+        wrap_angle,
+    )
 except ImportError:  # this file was copied on its own
     from compiled import compiled
-    from geometry import check_fields, check_poses, compose, relative_pose, transform_points, wrap_angle
+    from geometry import (
+        check_fields,
+        check_number,
+        check_poses,
+        compose,
+        relative_pose,
+        transform_points,
+        wrap_angle,
+    )
 
 
 _FIRST_REACH = (6.0, 0.8, np.deg2rad(4.0))  # of a search for the first motion [m, m, rad]
@@ -202,8 +218,20 @@ def icp_2d(
     Raises
     ------
     OdometryError
-        If a cloud has another shape or a value that is not finite. Yin et al. 2020, Sec. III-B, below Eq. 7.
+        If a cloud has another shape or a value that is not finite, or a setting is out of its range. Yin et al. 2020,
+        Sec. III-B, below Eq. 7.
     """
+    for name, value, span in (
+        ("max_distance", max_distance, "(0, inf]"),
+        ("min_distance", min_distance, "(0, inf]"),
+        ("trim", trim, "(0, 1]"),
+        ("tolerance", tolerance, "[0, inf)"),
+    ):
+        check_number(name, value, span, error=OdometryError)
+    for name, value in (
+        ("max_iterations", max_iterations), ("min_matched", min_matched), ("max_points", max_points)
+    ):  # fmt: skip
+        check_number(name, value, "[1, inf)", True, OdometryError)
     source, pose = check_cloud(source, "source cloud"), check_poses(init, "initial guess").copy()
     target = target if isinstance(target, SortedCloud) else sort_cloud(target)
     if min(len(source), _count_around(target, min_matched)) < min_matched:
@@ -250,9 +278,12 @@ def search_motion(
     Raises
     ------
     OdometryError
-        If a cloud has another shape or a value that is not finite, or if both extend so far that the grid would need
-        more than 400 MB.
+        If a cloud has another shape or a value that is not finite, a setting is out of its range, or if both extend so
+        far that the grid would need more than 400 MB.
     """
+    check_number("reach", reach, "[0, 100]", error=OdometryError)  # all candidates are held in memory
+    check_number("cell", cell, "(0, inf)", error=OdometryError)
+    check_number("max_points", max_points, "[1, inf)", True, OdometryError)
     source, target = check_cloud(source, "source cloud"), check_cloud(target, "target cloud")
     best = check_poses(guess, "initial guess").copy()
     if min(len(source), len(target)) == 0:

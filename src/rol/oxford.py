@@ -920,7 +920,11 @@ def _find_sensor_faults(session: Session, sensor: str) -> list[str]:
     if missing:
         return [f"{path}: {fault}" for path, fault in missing]
     stamps, valid = load_timestamps(listing)
-    sizes = {entry.name: entry.is_file() and entry.stat().st_size for entry in os.scandir(folder)}
+    sizes = {
+        entry.name: entry.is_file() and entry.stat().st_size
+        for entry in os.scandir(folder)
+        if entry.name[0] != "."
+    }
     suffixes = (".png",) if sensor == "radar" else (".png", ".bin")
     frames = {name for name in sizes if name.endswith(suffixes) and name[:-4].isdecimal() and len(name) < 23}
     on_disk = np.unique(np.array([int(name[:-4]) for name in frames], dtype=np.int64))

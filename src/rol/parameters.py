@@ -28,6 +28,20 @@ MAKERS = {  # parameter -> how to get what it names
     "real_root": "`make real` gets the real data",
 }
 FROM_REPOSITORY = "it comes with the repository"
+CHOICES: dict[str, tuple[Any, ...]] = {  # parameter -> all its values
+    "bf16": ("auto", True, False),
+    "device": ("cpu", "cuda"),
+    "measurement": ("statistical", "rendered"),
+    "method": ("paper", "rol"),
+    "motion": ("none", "corrected"),
+    "points_source": ("raw", "fake", "real", "fake-corrected"),
+}
+MAY_BE_ZERO = ("seed", "twin_seed", "scan_number", "rendered_first", "gap_scans", "steps", "blocks")
+NETWORKS = {
+    "network": "safetensors",
+    "compared": "safetensors",
+    "networks": "json",
+}  # parameter -> file it needs
 
 
 class ParameterError(ValueError):
@@ -52,8 +66,8 @@ def check_parameters(
     Raises
     ------
     ParameterError
-        If the notebook is not found, or a parameter is unknown, missing, of another type than its default, NaN, or
-        names a file, folder or session to read that is not there.
+        If the notebook is not found, or a parameter is unknown, missing, of another type than its default, out of
+        range, none of its choices, or names a file, folder, session or network to read that is not there.
     """
     if Path.cwd().name == "notebooks":
         os.chdir("..")
@@ -63,11 +77,15 @@ def check_parameters(
     for name, default in defaults.items():
         if name not in namespace:
             faults.append(f"{name}: missing, its default is {default!r}")
-        elif fault := _type_fault(namespace[name], default) or (
-            name not in optional and _path_fault(name, namespace[name], default)
+        elif (
+            fault := _type_fault(namespace[name], default)
+            or _range_fault(name, namespace[name], default)
+            or (name not in optional and _path_fault(name, namespace[name], default))
         ):
             faults.append(f"{name}: {fault}")
-    faults = faults or _session_faults({name: namespace[name] for name in defaults})
+    if not faults:
+        given = {name: namespace[name] for name in defaults}
+        faults = _session_faults(given) + _network_faults(given)
     if faults:
         known = f" (parameters: {', '.join(defaults)})" if any("unknown" in fault for fault in faults) else ""
         raise ParameterError(f"notebooks/{notebook}.ipynb: {'; '.join(faults)}{known}")
@@ -105,6 +123,19 @@ def read_parameters(path: Path | str) -> dict[str, Any]:
     raise ParameterError(f"{path}: has no cell tagged `parameters`")
 
 
+def positive(text: str) -> int:
+    """Read a whole number of at least 1, as ``type`` of an argument of `argparse`.
+
+    Raises
+    ------
+    ValueError
+        If the text is no such number.
+    """
+    if int(text) < 1:
+        raise ValueError
+    return int(text)
+
+
 def _literal_names(namespace: MutableMapping[str, Any]) -> list[str]:
     """List names of plain values that a person or papermill has set, without IPython's own."""
     kinds = (bool, int, float, str, list, dict, tuple, type(None))
@@ -134,6 +165,24 @@ def _type_fault(value: Any, default: Any) -> str:
     return ""
 
 
+def _range_fault(name: str, value: Any, default: Any) -> str:
+    """Describe why a value of the right type is out of range; empty if it is not.
+
+    Only numbers with a negative default may be negative. Counts, whole numbers with a default above 0, start at 1.
+    """
+    if name in CHOICES:
+        known = ", ".join(map(repr, CHOICES[name]))
+        return "" if value in CHOICES[name] else f"{value!r} is none of {known}"
+    if name == "max_scans" and value == 1:
+        return "one scan is no path; 0 uses all"
+    if value == "" != default:
+        return f"must not be empty; its default is {default!r}"
+    if isinstance(default, (int, float)) and value < 0 <= default:
+        return f"must not be negative, got {value}"
+    is_count = type(default) is int and default > 0 and name not in MAY_BE_ZERO
+    return f"must be at least 1, got {value}" if is_count and value < 1 else ""
+
+
 def _path_fault(name: str, value: Any, default: Any) -> str:
     """Describe a file or folder that is missing; empty if it exists or the parameter names none to read."""
     is_path = isinstance(default, str) and ("/" in default or name.endswith("_root")) and name != "out_dir"
@@ -159,3 +208,19 @@ def _session_faults(parameters: dict[str, Any]) -> list[str]:
         if session in there
         else [f"session: {session!r} is not in {root}; there are: {', '.join(there) or 'none'}"]
     )
+
+
+def _network_faults(parameters: dict[str, Any]) -> list[str]:
+    """List the networks that have no file in the folder of the weights; "chapter 04" trains its own."""
+    if "weights_root" not in parameters:
+        return []
+    faults = []
+    for name in parameters.keys() & NETWORKS.keys():
+        value, root, ending = parameters[name], Path(parameters["weights_root"]), NETWORKS[name]
+        faults += [
+            f"{name}: {network!r} has no file {root / f'{network}.{ending}'}; there are: "
+            + (", ".join(sorted(path.stem for path in root.glob(f"[!.]*.{ending}"))) or "none")
+            for network in ([value] if isinstance(value, str) else value)
+            if network != "chapter 04" and not (root / f"{network}.{ending}").is_file()
+        ]
+    return faults

@@ -14,6 +14,7 @@ There is no dropout: nothing is drawn after the first weights but the order of t
 from __future__ import annotations
 
 import json
+import math
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
@@ -628,11 +629,14 @@ def load_weights(
     for name, wanted in (("filters", filters), ("blocks", blocks)):
         if wanted is not None and about[name] != wanted:
             raise Pix2PixError(f"{path}: generator with {about[name]} {name}, expected {wanted}")
-    generator = build_generator(about["filters"], about["blocks"], network, rng=torch.Generator())
-    try:
+    try:  # a width or depth far too large has no room in memory, which is a RuntimeError too
+        generator = build_generator(about["filters"], about["blocks"], network, rng=torch.Generator())
         generator.load_state_dict(tensors)
     except RuntimeError as error:
         raise Pix2PixError(f"{path}: tensors do not fit the header's architecture ({error})") from error
+    for name, value in generator.state_dict().items():
+        if tensors[name].is_floating_point() != value.is_floating_point():
+            raise Pix2PixError(f"{path}: tensor {name!r} is of {tensors[name].dtype}, expected {value.dtype}")
     generator.image_size = tuple(about["image_size"]) if about.get("image_size") else None
     generator.headings = int(about.get("headings", 1))
     if network == "unet":
@@ -709,8 +713,10 @@ def load_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
 
 
 def _check_finite(path: Path, tensors: dict[str, Tensor]) -> None:
-    """Refuse tensors with a value that is not finite."""
+    """Refuse tensors of a type that torch cannot compute with, or with a value that is not finite."""
     for name, tensor in tensors.items():
+        if tensor.is_floating_point() and tensor.element_size() < 2:
+            raise Pix2PixError(f"{path}: tensor {name!r} is of {tensor.dtype}, expected at least 16 bits")
         if not torch.isfinite(tensor).all():
             raise Pix2PixError(f"{path}: tensor {name!r} holds a value that is not finite")
 
@@ -727,5 +733,9 @@ def _check_header(path: str | Path, about: dict[str, Any]) -> None:
         "headings": about.get("headings", 1)
     }
     for name, number in [*numbers.items(), *(("image_size", n) for n in size or ())]:
-        if type(number) is not int or number < 0:
-            raise Pix2PixError(f"{path}: header: {name} is {number!r}, expected a whole number")
+        low, high = {"blocks": (0, math.inf), "headings": (1, 4)}.get(name, (1, math.inf))
+        if type(number) is not int or not low <= number <= high:
+            raise Pix2PixError(
+                f"{path}: header: {name} is {number!r}, expected a whole number from {low}"
+                + (f" to {high}" if high < math.inf else "")
+            )

@@ -204,7 +204,7 @@ def _prepare_folder(folder: Path, wanted: dict[str, Any], report: Callable[[str]
         changed = sorted(key for key in {*found, *wanted} if found.get(key) != wanted.get(key))
         report(f"{folder.name}: settings changed ({', '.join(changed)}), starting anew")
         for entry in (folder / name for name in _MADE):
-            if entry.is_dir():
+            if entry.is_dir() and not entry.is_symlink():
                 shutil.rmtree(entry)
             else:
                 entry.unlink(missing_ok=True)
