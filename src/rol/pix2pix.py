@@ -635,7 +635,7 @@ def load_weights(
     except RuntimeError as error:
         raise Pix2PixError(f"{path}: tensors do not fit the header's architecture ({error})") from error
     for name, value in generator.state_dict().items():
-        if tensors[name].is_floating_point() != value.is_floating_point():
+        if value.is_floating_point() and not tensors[name].is_floating_point():
             raise Pix2PixError(f"{path}: tensor {name!r} is of {tensors[name].dtype}, expected {value.dtype}")
     generator.image_size = tuple(about["image_size"]) if about.get("image_size") else None
     generator.headings = int(about.get("headings", 1))
