@@ -213,7 +213,9 @@ def test_session_of_ones_own_is_read_as_oxfords_and_aligned(tmp_path: Path) -> N
     shutil.rmtree(tmp_path / "sessions/my-town/velodyne_right")  # one lidar is enough, as the page says
     (tmp_path / "sessions/my-town/velodyne_right.timestamps").unlink()
     words = shlex.split(dict(code_blocks(OWN_RADAR, "Write Oxford's files"))["bash"])
-    command = [sys.executable, "-m", words[0], str(ROOT / words[1]), *words[2:]]
+    (tmp_path / "notebooks").mkdir()
+    shutil.copy(ROOT / words[1], tmp_path / "notebooks")
+    command = [sys.executable, "-m", *words]
     environment = {**os.environ, "PYTHONPATH": str(ROOT / "src"), "MPLBACKEND": "Agg"}
     answer = subprocess.run(
         command, cwd=tmp_path, env=environment, capture_output=True, encoding="utf-8", check=False
