@@ -187,7 +187,7 @@ def load_session(fakes: Path, session: Path) -> tuple[Clouds, np.ndarray, np.nda
 
 def find_sessions(results: Path, sessions: Path) -> dict[str, tuple[Clouds, np.ndarray, np.ndarray]]:
     """Load every localization session that has fakes."""
-    folders = sorted((results / "fake").glob("virtual-*-seq*"))
+    folders = sorted(path.parent for path in (results / "fake").glob("virtual-*-seq*/fake.json"))
     if not folders:
         raise ValueError(f"{results / 'fake'}: no fakes of sessions virtual-*-seq*; `make book` makes them")
     return {folder.name: load_session(folder, sessions / folder.name) for folder in folders}
