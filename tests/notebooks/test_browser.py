@@ -150,7 +150,8 @@ def test_search_finds_pages_without_a_network(html: Path, chromium: Browser) -> 
     found = tab.run("""new Promise((done) => {
         const look = (left) => {
             const names = [...document.querySelectorAll("#search-results li a")].map((link) => link.href);
-            if (names.length || !left) done(names); else setTimeout(look, 100, left - 1);
+            const isListed = names.some((name) => name.includes("07_localization"));
+            if (isListed || !left) done(names); else setTimeout(look, 100, left - 1);
         };
         look(100);
     })""")
