@@ -629,7 +629,7 @@ def load_weights(
     for name, wanted in (("filters", filters), ("blocks", blocks)):
         if wanted is not None and about[name] != wanted:
             raise Pix2PixError(f"{path}: generator with {about[name]} {name}, expected {wanted}")
-    try:  # a width or depth far too large has no room in memory, which is a RuntimeError too
+    try:  # also raised when the width or depth needs more memory than there is
         generator = build_generator(about["filters"], about["blocks"], network, rng=torch.Generator())
         generator.load_state_dict(tensors)
     except RuntimeError as error:

@@ -157,7 +157,7 @@ class VirtualSettings:
 
     def __post_init__(self) -> None:
         allowed = {
-            "[450, inf)": "loop_m",  # shorter ones leave no room for streets with houses
+            "[450, inf)": "loop_m",  # shorter loops are too small for streets with houses
             "(0, inf)": "radar_height_m",
             "[0, inf)": "seed relief_m labels_every odometry_scale odometry_yaw_rad unmapped_share",
             "(-inf, inf)": "start_m",
