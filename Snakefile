@@ -136,7 +136,7 @@ rule virtual_session:
         'made={params.made:q}; [ "$(cat "$made.code" 2>/dev/null)" = {params.code} ] '
         """|| ! grep -qs '"format":' "$made/settings.json" || rm -rf "$made"; """
         'echo {params.code} > "$made.code"; '
-        + ENVIRONMENT + "{PYTHON:q} -m rol.virtual {CONFIG_FILE:q} --session {wildcards.session:q} --out {SESSIONS_ROOT:q} "
+        + ENVIRONMENT + "{PYTHON:q} -m rol_sim {CONFIG_FILE:q} --session {wildcards.session:q} --out {SESSIONS_ROOT:q} "
         "> {log:q} 2>&1 || {{ tail -n 30 {log:q}; exit 1; }}"
 
 

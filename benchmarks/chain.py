@@ -26,14 +26,15 @@ import torch
 from filter import open_map
 from translator import ROOT, describe_machine
 
-from rol import mcl, rall
+from rol import mcl
 from rol.files import write_text
-from rol.front_ends import Translator, detect_points, load_translator, translate_scan
-from rol.motion import MotionModel, mover
 from rol.odometry import local_map_odometry
 from rol.oxford import load_radar, load_timestamps
-from rol.parameters import positive
 from rol.pix2pix import ResnetGenerator, has_bf16
+from rol_beyond.front_ends import Translator, detect_points, load_translator, translate_scan
+from rol_beyond.motion import MotionModel, mover
+from rol_book.parameters import positive
+from rol_data import rall
 
 NETWORKS = {"network rol, four headings": ("rol", None), "network rol, one heading": ("rol", 1),
             "network paper, narrow": ("paper", None)}  # fmt: skip

@@ -28,11 +28,12 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 from translator import ROOT, describe_machine, take_turns
 
-from rol import mcl, rall
+from rol import mcl
 from rol.files import write_text
 from rol.geometry import invert, transform_points
 from rol.mcl import MapGrid
-from rol.parameters import positive
+from rol_book.parameters import positive
+from rol_data import rall
 
 CELLS = (0.5, 0.25, 0.125)  # sides of a cell [m]
 RANGE = 64.0  # of the translator's points [m]

@@ -42,7 +42,6 @@ import open3d as o3d
 from scipy.spatial import cKDTree
 from translator import ROOT, describe_machine
 
-from rol import rall
 from rol.bev import image_to_points
 from rol.evaluation import KITTI_LENGTHS_M, drift_by_length, pose_errors, read_tum, rmse
 from rol.fakes import list_fakes, read_image
@@ -50,6 +49,7 @@ from rol.files import write_text
 from rol.geometry import accumulate_steps, compose, relative_pose, transform_points
 from rol.odometry import chain, correct_cloud, fit_rigid, icp_2d, local_map_odometry
 from rol.radar import KIT_RANGE_RESOLUTION, MEASURED_RANGE_RESOLUTION
+from rol_data import rall
 
 try:
     import small_gicp

@@ -17,12 +17,14 @@ from time import perf_counter
 
 import numpy as np
 
-from rol import oxford, rall
+from rol import oxford
 from rol.files import write_text
-from rol.parameters import positive
-from rol.virtual import radar_sensor, radar_signal
-from rol.virtual.session import VirtualSession, build_session, make_scan, make_sweep, sensor_settings
-from rol.virtual.settings import load_settings
+from rol_book.parameters import positive
+from rol_data import rall
+from rol_sim.sensors import radar as radar_sensor
+from rol_sim.sensors import radar_signal
+from rol_sim.session.assembly import VirtualSession, build_session, make_scan, make_sweep, sensor_settings
+from rol_sim.session.settings import load_settings
 
 ROOT = Path(__file__).resolve().parents[1]
 

@@ -28,12 +28,12 @@ from scipy.ndimage import map_coordinates
 
 from rol.bev import image_to_points
 from rol.files import write_text
-from rol.parameters import positive
 from rol.pix2pix import TrainConfig, build_generator, generate, has_bf16, load_weights
 from rol.radar import polar_to_cartesian
 from rol.similarity import nn_distances
 from rol.training import TrainingState
-from rol.unet import fuse
+from rol_beyond.unet import fuse
+from rol_book.parameters import positive
 
 ROOT = Path(__file__).resolve().parents[1]
 SHIPPED = ROOT / "data" / "weights" / "rol.safetensors"

@@ -335,7 +335,7 @@ def chapter_digest(path: str | Path) -> str:
 
 def virtual_digest() -> str:
     """Give the digest of all code that makes virtual sessions."""
-    files = module_files(["import rol.virtual.__main__"])
+    files = module_files(["import rol_sim.__main__"])
     return digest(code_text(file.read_text(encoding="utf-8")) for file in files)
 
 

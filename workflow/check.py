@@ -27,7 +27,7 @@ from statistics import fmean
 
 from chapters import ROOT, ChapterError, Run, load_config
 from rol.files import read_text, write_text
-from rol.rall import find_real_root
+from rol_data.rall import find_real_root
 
 REFERENCE = ROOT / "data" / "reference"
 PAGE = ROOT / "book" / "did_it_reproduce.md"

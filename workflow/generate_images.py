@@ -13,7 +13,7 @@ import sys
 import torch
 
 from rol.fakes import translate_session
-from rol.parameters import positive
+from rol_book.parameters import positive
 
 BF16 = {"auto": "auto", "true": True, "false": False}
 

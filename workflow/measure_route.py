@@ -22,13 +22,12 @@ import pandas as pd
 from rol.evaluation import consistency, pose_errors, summarize
 from rol.files import write_text
 from rol.mcl import MclSettings, settings_for
-from rol.motion import MotionModel
-from rol.parameters import positive
-from rol.rall import find_real_root
-from rol.recovery import RecoverySettings
-from rol.route import Route, RouteRun, list_routes
-from rol.virtual.map_points import FrontEnd
-from rol.virtual.route_runs import (
+from rol_beyond.motion import MotionModel
+from rol_beyond.recovery import RecoverySettings
+from rol_book.parameters import positive
+from rol_data.rall import find_real_root
+from rol_study.route import Route, RouteRun, list_routes
+from rol_study.route_runs import (
     Stage,
     add_outliers,
     draw_session,
@@ -37,6 +36,7 @@ from rol.virtual.route_runs import (
     set_stage,
     start_anywhere,
 )
+from rol_study.sampled_points import FrontEnd
 
 ROOT = Path(__file__).resolve().parents[1]
 SHORT = 3000  # scans of the runs that compare settings
@@ -175,8 +175,8 @@ def measure_rendered(real_root: str, number: str, first: int, n_scans: int, seed
     """Both methods with the virtual radar through the translator, on a stretch where it never learnt."""
     import torch
 
-    from rol.front_ends import load_translator
-    from rol.virtual.rendered import render_clouds
+    from rol_beyond.front_ends import load_translator
+    from rol_study.rendered_points import render_clouds
 
     torch.set_num_threads(1)
     stage = stage_of(real_root, number, (0.80, 0.88))
@@ -248,7 +248,7 @@ def list_tuned(numbers: list[str]) -> list[tuple]:
 
 def stage_length(real_root: str, number: str) -> np.ndarray:
     """Poses of a session, for their number."""
-    from rol.rall import POSES_PATH, load_poses
+    from rol_data.rall import POSES_PATH, load_poses
 
     return load_poses(Path(real_root, POSES_PATH, f"pose_xy_{number}.txt"))
 

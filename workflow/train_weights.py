@@ -32,8 +32,8 @@ from rol.evaluation import read_tum
 from rol.files import read_text, write_text
 from rol.oxford import compose_odometry, load_radar_odometry, open_session
 from rol.pairs import estimate_twists, job_of_row
-from rol.parameters import positive
-from rol.scan_pairs import JoinedPairs, ScanPairs, gather_clouds
+from rol_beyond.scan_pairs import JoinedPairs, ScanPairs, gather_clouds
+from rol_book.parameters import positive
 
 DATA = Path(__file__).resolve().parents[1] / "data"
 WEIGHTS, ABLATIONS = DATA / "weights", DATA / "ablations" / "translator.csv"
@@ -64,8 +64,8 @@ def load_recipe(path: Path) -> dict[str, Any]:
 
 def make_sessions(recipe: dict[str, Any], names: set[str], jobs: int) -> None:
     """Write the virtual sessions that are asked for and not there yet."""
-    from rol.virtual.settings import parse_settings
-    from rol.virtual.writer import write_session
+    from rol_sim.session.settings import parse_settings
+    from rol_sim.session.writer import write_session
 
     known = set()
     for number, world in enumerate(recipe["worlds"]):
@@ -117,7 +117,7 @@ def open_real() -> tuple[list[Any], Any] | None:
     """Give the real scans and the tree of the real map, or None where the real data are not at hand."""
     from scipy.spatial import cKDTree
 
-    from rol import rall
+    from rol_data import rall
 
     root = rall.find_real_root()
     if root is None or not (root / rall.SCANS_PATH).is_dir():
@@ -131,8 +131,8 @@ def judge(
 ) -> pd.DataFrame:
     """Judge a network on every set but the one it learnt from, and on the real scans against the real map."""
     from rol.bev import image_to_points
-    from rol.front_ends import MIN_RANGE_M, Translator, judge_on_map, translate_scan
     from rol.training import score_points
+    from rol_beyond.front_ends import MIN_RANGE_M, Translator, judge_on_map, translate_scan
 
     tables = [
         score_points(generator, pairs, LEVELS, thin=thin).assign(places=name)

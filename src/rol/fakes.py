@@ -86,7 +86,8 @@ def translate_session(
     ValueError
         If the weights or a radar image cannot be used; the message names the file.
     """
-    from .front_ends import load_translator
+    from rol_beyond.front_ends import load_translator
+
     from .pairs import list_pairs
     from .pix2pix import choose_bf16
 

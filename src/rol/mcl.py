@@ -765,7 +765,7 @@ def localize(
         Called with the scan's number and the estimate; a pose that it returns restarts the particles there,
         as the authors did by hand.
     move : callable, optional
-        Moves particles by a step, such as `rol.motion.sample_motion` with a learnt model; `predict` if not given.
+        Moves particles by a step, such as `rol_beyond.motion.sample_motion` with a learnt model; `predict` if not given.
     n_first : int, optional
         Particles at the first scan, where the start is known badly; ``settings.n_particles`` if not given.
 

@@ -3,7 +3,7 @@
 Images are tensors of shape (b, 1, h, w) in [-1, 1]: -1 is empty (pixel 0), +1 is occupied (pixel 255). Row 0
 is the farthest forward, column 0 the farthest left. The architecture is that of the public pix2pix and
 CycleGAN code with one channel in and one channel out (Yin et al. 2020, Sec. III-A, Eq. 2-5, and Sec. IV-A).
-Only this room and `rol.unet` import torch when they are imported; `rol.training` holds the loop.
+Only this room and `rol_beyond.unet` import torch when they are imported; `rol.training` holds the loop.
 
 Batch norm takes the statistics of the images it is given, in training and in use alike, and keeps no running
 ones. The public code does so too when it is used as its authors use it, and with one image per batch the
@@ -35,7 +35,7 @@ except ImportError:  # this file was copied on its own
     from geometry import check_fields
 
 if TYPE_CHECKING:
-    from .unet import UnetGenerator
+    from rol_beyond.unet import UnetGenerator
 
 ARCHITECTURES = {
     "resnet": "resnet-generator, batch statistics, 1 to 1 channel",
@@ -51,7 +51,7 @@ class Pix2PixError(ValueError):
 class TrainConfig:
     """Settings of one training run; the defaults are the paper's, or the public code's where it is silent."""
 
-    network: str = "resnet"  # the paper's; "unet": `rol.unet`, smaller and quicker
+    network: str = "resnet"  # the paper's; "unet": `rol_beyond.unet`, smaller and quicker
     filters: int = 64  # width of the generator's first layer; public default
     blocks: int = 9  # residual blocks; Sec. IV-A, "ResNet with 9 blocks"
     discriminator_filters: int = 64  # width of the discriminator's first layer; public default
@@ -69,7 +69,7 @@ class TrainConfig:
     rotate: bool = False  # True: every pair in a heading drawn anew; the paper does not
     gain_spread_db: float = 0.0  # spread of a gain drawn anew for every scan; the paper has none
     streaks: float = (
-        0.0  # bright streaks added to a scan on average, see `rol.scan_pairs`; the paper adds none
+        0.0  # bright streaks added to a scan on average, see `rol_beyond.scan_pairs`; the paper adds none
     )
     ghosts: float = 0.0  # echoes that appear a second time elsewhere, on average; the paper adds none
     learning_rate: float = 2e-4  # Adam; public default
@@ -197,7 +197,7 @@ def build_generator(
     blocks : int
         Residual blocks; 9 in the paper.
     network : str
-        "resnet", the paper's, or "unet", see `rol.unet`.
+        "resnet", the paper's, or "unet", see `rol_beyond.unet`.
     rng : torch.Generator
         Source of the weights, N(0, 0.02) as in pix2pix.
 
@@ -218,7 +218,7 @@ def build_generator(
             f"generator: filters must be at least 1 and blocks at least 0, got {filters}, {blocks}"
         )
     if network == "unet":
-        from .unet import UnetGenerator as Network
+        from rol_beyond.unet import UnetGenerator as Network
     else:
         Network = ResnetGenerator
     with torch.device("meta"):  # no weights drawn from torch's global state
@@ -640,7 +640,7 @@ def load_weights(
     generator.image_size = tuple(about["image_size"]) if about.get("image_size") else None
     generator.headings = int(about.get("headings", 1))
     if network == "unet":
-        from .unet import fuse
+        from rol_beyond.unet import fuse
 
         fuse(generator)
     return generator.eval()

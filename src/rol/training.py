@@ -21,8 +21,9 @@ import pandas as pd
 if TYPE_CHECKING:
     from torch import Tensor
 
+    from rol_beyond.unet import UnetGenerator
+
     from .pix2pix import ResnetGenerator, TrainConfig
-    from .unet import UnetGenerator
 
 HISTORY_COLUMNS = ["step", "epoch", "learning_rate", "loss_d", "loss_gan", "loss_l1", "held_out_l1"]
 
@@ -186,7 +187,7 @@ def train(
     ----------
     dataset, held_out : sequence of (radar, lidar), each array float32 (1, h, w) in [-1, 1]
         Pairs to learn from, and pairs that are only looked at. With `config.rotate`, `config.gain_spread_db`,
-        `config.streaks` or `config.ghosts` the former need a method `draw`, see `rol.scan_pairs.ScanPairs`. Where it has a method
+        `config.streaks` or `config.ghosts` the former need a method `draw`, see `rol_beyond.scan_pairs.ScanPairs`. Where it has a method
         `name(index)`, errors name the files of a batch by it.
     config : TrainConfig
         The settings.
@@ -384,7 +385,7 @@ def _check_run(dataset: Any, config: TrainConfig) -> None:
         raise TrainingError("no pairs to train on")
     if _is_drawn(config) and not hasattr(dataset, "draw"):
         raise TrainingError(
-            "rotate, gain_spread_db, streaks and ghosts need pairs that are drawn, see rol.scan_pairs"
+            "rotate, gain_spread_db, streaks and ghosts need pairs that are drawn, see rol_beyond.scan_pairs"
         )
     if config.checkpoint_every % config.report_every:
         every = (config.checkpoint_every, config.report_every)

@@ -19,7 +19,7 @@ from chapters import (
     read_notebook,
     run_parameters,
 )
-from rol.rall import find_real_root
+from rol_data.rall import find_real_root
 
 METRICS = {
     *("method", "session", "n_scans", "failures", "rmse_m", "rmse_yaw_deg"),

@@ -1,0 +1,360 @@
+"""Pairs for training that are made when asked for, in any heading, from polar scans and lidar points.
+
+A radar that turns sees the world from any heading alike. Turning the car's frame before the scan is resampled
+and before the lidar points are drawn gives a pair that is as good as the recorded one: no pixel is
+interpolated twice, no corner is lost. Images as in the bird's-eye room.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from io import BytesIO
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+STEP_M = 0.05  # lidar points are kept once per cell of this edge
+
+
+@dataclass(frozen=True)
+class LidarClouds:
+    """The lidar points of many scans, without the ground, in the radar frame.
+
+    Attributes
+    ----------
+    points : array, shape (m, 2), int16
+        All points, scan by scan, in steps of `STEP_M`.
+    starts : array, shape (n + 1,), int64
+        Where each scan begins.
+    """
+
+    points: np.ndarray
+    starts: np.ndarray
+
+    def cloud(self, index: int) -> np.ndarray:
+        """Give the points of one scan, shape (k, 2) [m]."""
+        return self.points[self.starts[index] : self.starts[index + 1]] * STEP_M
+
+
+class ScanPairs:
+    """Pairs of one session for training, each made from the polar scan and the lidar points.
+
+    Parameters
+    ----------
+    session : rol.oxford.Session
+        The session.
+    jobs : sequence of dict
+        The scans, from `rol.pairs.job_of_row`.
+    clouds : LidarClouds
+        Their lidar points, from `gather_clouds`.
+    settings : dict
+        Those of `rol.pairs.build_pair` that concern the radar image and its size.
+    """
+
+    def __init__(
+        self, session: Any, jobs: Sequence[dict[str, Any]], clouds: LidarClouds, settings: dict[str, Any]
+    ) -> None:
+        if len(jobs) != len(clouds.starts) - 1:
+            raise ValueError(f"{session.name}: {len(jobs)} scans, but clouds of {len(clouds.starts) - 1}")
+        self.session, self.jobs, self.clouds, self.settings = session, list(jobs), clouds, settings
+
+    def __len__(self) -> int:
+        return len(self.jobs)
+
+    def __getitem__(self, index: int) -> tuple[np.ndarray, np.ndarray]:
+        """Give a pair as it was recorded, see `draw`."""
+        return self.draw(index, 0.0)
+
+    def name(self, index: int) -> str:
+        """Name the file of the scan."""
+        return str(self.session.radar_path(self.jobs[index]["radar_stamp"]))
+
+    def draw(
+        self,
+        index: int,
+        turn: float,
+        gain_db: float = 0.0,
+        n_streaks: int = 0,
+        n_ghosts: int = 0,
+        rng: np.random.Generator | None = None,
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Make one pair, the world turned about the radar, the radar deafer or keener, or dazzled at some bearings.
+
+        Parameters
+        ----------
+        index : int
+            Which scan.
+        turn : float
+            Counter-clockwise turn of everything that is seen [rad].
+        gain_db : float
+            Added to all power that is not zero [dB].
+        n_streaks, n_ghosts : int
+            Streaks and ghosts added, see `add_streaks` and `add_ghosts`.
+        rng : numpy.random.Generator, optional
+            Draws them; needed if there are any.
+
+        Returns
+        -------
+        radar, lidar : array, shape (1, h, w), float32
+            -1 for code 0 and for empty, +1 for code 255 and for occupied.
+        """
+        from rol.bev import points_to_image
+        from rol.oxford import load_radar
+
+        scan = load_radar(self.session.radar_path(self.jobs[index]["radar_stamp"]))
+        codes = shift_codes(scan.codes, gain_db)
+        if n_streaks + n_ghosts > 0:
+            if rng is None:
+                raise ValueError("streaks and ghosts need a generator of random numbers")
+            codes = add_ghosts(add_streaks(codes, n_streaks, rng), n_ghosts, rng)
+        radar = turned_radar_image(codes, scan.azimuths, turn, self.jobs[index]["twist"], self.settings)
+        c, s = np.cos(turn), np.sin(turn)
+        points = self.clouds.cloud(index) @ np.array([[c, s], [-s, c]])
+        size = {
+            name: self.settings[name]
+            for name in ("width", "pixel_size", "max_range")
+            if name in self.settings
+        }
+        lidar = points_to_image(points, **size)
+        images = (
+            image[None].astype(np.float32) / np.float32(127.5) - np.float32(1.0) for image in (radar, lidar)
+        )
+        return tuple(images)  # type: ignore[return-value]
+
+
+def shift_codes(codes: np.ndarray, gain_db: float) -> np.ndarray:
+    """Add a gain [dB] to power codes of half a decibel each; what is zero stays zero, the rest stays above it."""
+    if gain_db == 0.0:
+        return codes
+    table = np.clip(np.arange(256) + round(2.0 * gain_db), 1, 255).astype(np.uint8)
+    table[0] = 0
+    return table[codes]
+
+
+def add_streaks(codes: np.ndarray, n: int, rng: np.random.Generator) -> np.ndarray:
+    """Dazzle a scan: a few neighbouring rows are bright along all their length, as behind a very strong reflector.
+
+    Parameters
+    ----------
+    codes : array, shape (a, b), uint8
+        Power codes of half a decibel each.
+    n : int
+        Number of streaks.
+    rng : numpy.random.Generator
+        Draws bearing, width, level, slope, grain and beat of each.
+
+    Returns
+    -------
+    codes : array, shape (a, b), uint8
+        A copy, nowhere darker than before.
+
+    Notes
+    -----
+    The ranges of the draws were read off the eleven real scans: one to five rows, a level of 15 to 43 dB that
+    falls by 1.5 to 5 dB each 13 m, grain like that of any echo, and in half of them echoes that come back every few
+    metres. What is real shines through, so the lidar image stays what it is. Not in the paper.
+    """
+    codes, (n_rows, n_bins) = codes.copy(), codes.shape
+    bins = np.arange(n_bins, dtype=np.float32)
+    for _ in range(n):
+        row, half_width = int(rng.integers(n_rows)), rng.uniform(0.5, 2.2)
+        begin, slope = rng.uniform(60.0, 600.0), rng.uniform(3.0, 10.0) / 300.0
+        level = rng.uniform(30.0, 85.0) - slope * np.maximum(bins - begin, 0.0) - 12.0 * (bins < begin)
+        if rng.random() < 0.5:
+            beat = np.cos(np.pi * bins / rng.uniform(70.0, 350.0) + rng.uniform(0.0, np.pi)) ** 8
+            level += rng.uniform(5.0, 25.0) * (beat - 0.5)
+        for aside in range(-int(np.ceil(half_width)), int(np.ceil(half_width)) + 1):
+            grain = np.interp(bins, bins[::5], 20.0 * np.log10(rng.gamma(0.6, 1.5, len(bins[::5])) + 1e-3))
+            streak = level - 12.0 * (aside / half_width) ** 2 + grain
+            here = (row + aside) % n_rows
+            codes[here] = np.maximum(codes[here], np.clip(streak, 0.0, 250.0).astype(np.uint8))
+    return codes
+
+
+def add_ghosts(codes: np.ndarray, n: int, rng: np.random.Generator) -> np.ndarray:
+    """Let bright echoes appear a second time at another place, as behind a mirror, or a vehicle that has come.
+
+    Parameters
+    ----------
+    codes : array, shape (a, b), uint8
+        Power codes of half a decibel each.
+    n : int
+        Number of ghosts.
+    rng : numpy.random.Generator
+        Draws the echo, its size, where it goes and how much weaker it is there.
+
+    Returns
+    -------
+    codes : array, shape (a, b), uint8
+        A copy, nowhere darker than before.
+
+    Notes
+    -----
+    A lidar sees no ghosts, and a map no vehicles: what stands alone and has no shape should not be trusted. Not in
+    the paper.
+    """
+    found, (n_rows, n_bins) = codes.copy(), codes.shape
+    rows, bins = np.nonzero(codes[:, :1500:4] >= 70)  # within the image, 35 dB
+    for _ in range(n if len(rows) else 0):
+        one = int(rng.integers(len(rows)))
+        half_rows, half_bins = int(rng.integers(1, 6)), int(rng.integers(10, 60))
+        around = (rows[one] + np.arange(-half_rows, half_rows + 1)) % n_rows
+        begin = int(np.clip(4 * bins[one] - half_bins, 0, n_bins - 2 * half_bins))
+        patch = codes[around, begin : begin + 2 * half_bins].astype(np.int64) - int(rng.integers(0, 25))
+        there = (int(rng.integers(n_rows)) + np.arange(len(around))) % n_rows
+        place = int(rng.integers(100, min(1400, n_bins - 2 * half_bins)))
+        kept = found[there, place : place + 2 * half_bins]
+        found[there, place : place + 2 * half_bins] = np.maximum(kept, np.maximum(patch, 0).astype(np.uint8))
+    return found
+
+
+def turned_radar_image(
+    codes: np.ndarray, azimuths: np.ndarray, turn: float, twist: Sequence[float], settings: dict[str, Any]
+) -> np.ndarray:
+    """Make the radar image of `rol.pairs.build_pair` from a scan whose surroundings are turned.
+
+    Parameters
+    ----------
+    codes, azimuths : array, shape (a, b) and (a,)
+        The scan [rad].
+    turn : float
+        Counter-clockwise turn [rad].
+    twist : sequence of float
+        Body velocity (vx, vy, yaw rate) before the turn [m/s, m/s, rad/s].
+    settings : dict
+        ``motion`` ("none" or "corrected"), ``range_resolution``, ``range_offset``, ``doppler_seconds``,
+        ``width``, ``pixel_size``, each with the default of `build_pair`.
+
+    Returns
+    -------
+    image : array, shape (width, width), uint8
+        Power 0..255.
+    """
+    from rol.radar import (
+        DOPPLER_SECONDS,
+        MEASURED_RANGE_OFFSET,
+        MEASURED_RANGE_RESOLUTION,
+        polar_to_cartesian,
+    )
+
+    c, s = np.cos(turn), np.sin(turn)
+    vx, vy, rate = twist
+    turned = (c * vx - s * vy, s * vx + c * vy, rate)
+    power = polar_to_cartesian(
+        codes,
+        azimuths + turn,
+        range_resolution=settings.get("range_resolution", MEASURED_RANGE_RESOLUTION),
+        range_offset=settings.get("range_offset", MEASURED_RANGE_OFFSET),
+        pixel_size=settings.get("pixel_size", 0.25),
+        width=settings.get("width", 512),
+        twist=turned if settings.get("motion", "none") == "corrected" else None,
+        doppler_seconds=settings.get("doppler_seconds", DOPPLER_SECONDS),
+    )
+    return np.rint(power * 255.0).astype(np.uint8)
+
+
+def gather_clouds(
+    session: Any,
+    jobs: Sequence[dict[str, Any]],
+    path: str | Path,
+    settings: dict[str, Any],
+    *,
+    workers: int = 1,
+    report: Callable[[str], None] = lambda line: None,
+) -> LidarClouds:
+    """Read the sweeps of many scans once and keep their points, small enough for memory.
+
+    Parameters
+    ----------
+    session : rol.oxford.Session
+        The session.
+    jobs : sequence of dict
+        The scans, from `rol.pairs.job_of_row`.
+    path : path
+        File for the points, ``*.npz``; read instead if it is there and of these jobs and settings.
+    settings : dict
+        ``motion``, ``min_height`` and ``max_range`` of `rol.pairs.build_pair`.
+    workers : int
+        Processes.
+    report : callable
+        Takes a line about how far it has come.
+
+    Returns
+    -------
+    clouds : LidarClouds
+        In the order of the jobs.
+    """
+    from rol.files import write_bytes
+
+    path, about = Path(path), repr((sorted(settings.items()), [sorted(job.items()) for job in jobs]))
+    if path.is_file():
+        with np.load(path) as file:
+            if str(file["about"]) == about:
+                return LidarClouds(file["points"], file["starts"])
+    tasks, parts = [(session, job, settings) for job in jobs], []
+    with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
+        for part in pool.map(_gather_one, tasks, chunksize=8):
+            parts.append(part)
+            if len(parts) % 500 == 0:
+                report(f"{session.name}: lidar points of {len(parts)} of {len(jobs)} scans")
+    clouds = LidarClouds(np.concatenate(parts), np.cumsum([0, *map(len, parts)]))
+    content = BytesIO()
+    np.savez_compressed(content, points=clouds.points, starts=clouds.starts, about=about)
+    write_bytes(path, content.getvalue())
+    return clouds
+
+
+def _gather_one(task: tuple[Any, dict[str, Any], dict[str, Any]]) -> np.ndarray:
+    from rol.lidar import crop_range, remove_ground
+    from rol.pairs import load_lidar_points
+
+    session, job, settings = task
+    twist = job["twist"] if settings.get("motion", "none") == "corrected" else None
+    points = load_lidar_points(
+        session, job["left_stamp"], job["right_stamp"], mid_stamp_us=job["mid_stamp_us"], twist=twist
+    )
+    points = crop_range(
+        remove_ground(points, settings.get("min_height", -1.5)), settings.get("max_range", 64.0) + 0.25
+    )
+    return np.unique(np.rint(points[:, :2] / STEP_M).astype(np.int16), axis=0)
+
+
+class JoinedPairs:
+    """Several sets of pairs one after the other, as one.
+
+    Parameters
+    ----------
+    parts : sequence
+        Sets with `__len__`, `__getitem__`, `draw` and `name`, such as `ScanPairs`.
+    """
+
+    def __init__(self, parts: Sequence[Any]) -> None:
+        self.parts, self.ends = list(parts), np.cumsum([len(part) for part in parts])
+
+    def __len__(self) -> int:
+        return int(self.ends[-1]) if len(self.ends) else 0
+
+    def _find(self, index: int) -> tuple[Any, int]:
+        if not 0 <= index < len(self):
+            raise IndexError(f"pair {index} of {len(self)}")
+        part = int(np.searchsorted(self.ends, index, side="right"))
+        return self.parts[part], index - int(self.ends[part] - len(self.parts[part]))
+
+    def __getitem__(self, index: int) -> tuple[np.ndarray, np.ndarray]:
+        """Give a pair as it was recorded."""
+        part, place = self._find(index)
+        return part[place]
+
+    def draw(self, index: int, *changes: Any) -> tuple[np.ndarray, np.ndarray]:
+        """Give a pair with what `ScanPairs.draw` changes: turn, gain, streaks, ghosts and their generator."""
+        part, place = self._find(index)
+        return part.draw(place, *changes)
+
+    def name(self, index: int) -> str:
+        """Name the file that a pair comes from."""
+        part, place = self._find(index)
+        return part.name(place)

@@ -1,0 +1,484 @@
+"""A virtual session before it is a folder: the town as it finds it, drive, traffic, times, scans, sweeps.
+
+Every scan and sweep has a generator of its own, so each can be made alone and in any order; `writer` puts
+them on disk.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, fields, replace
+from functools import lru_cache, partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from rol.oxford import RadarScan
+    from rol_sim.drive.planned import Drive
+    from rol_sim.drive.traffic import Traffic
+    from rol_sim.sensors.lidar import LidarSettings, Sweep
+    from rol_sim.sensors.radar import RadarSettings
+    from rol_sim.session.settings import SessionSettings, VirtualSettings
+    from rol_sim.world.mapped import Cells
+    from rol_sim.world.mesh import Mesh
+    from rol_sim.world.scene import Scene
+    from rol_sim.world.town import Town
+
+LIDARS = ("velodyne_left", "velodyne_right")
+FIRST_COUNT, COUNT_STEP = 13, 14  # encoder counts of the radar's rows: 13, 27, ... 5599 of 5600
+WORLD_RADIUS_M = 180.0  # how far from the drive a world grown from a map reaches
+CAR_M = 1.8  # so near to where the car drives stands nothing, whatever the map says
+CLEAR_M = 3.0  # what the map does not show stays so far from there
+# Parts of a session that draw from generators of their own.
+DRESS, DRIVE, TRAFFIC, SCANS, SWEEPS, ODOMETRY, GPS, INS, SCAN, SWEEP = range(10)
+
+
+@dataclass(frozen=True)
+class VirtualSession:
+    """A session before it is written: the town as it finds it, its drive, its traffic and its times.
+
+    Attributes
+    ----------
+    settings : VirtualSettings
+        The settings of all sessions.
+    name : str
+        The session.
+    town : Town or None
+        The town; None where the world is grown from a map.
+    ground : callable
+        Gives the height of the land at places, shape (n, 2) -> (n,) [m].
+    scene : Scene
+        The world as this session finds it, without what moves.
+    drive : Drive
+        Where the radar is at any time.
+    traffic : Traffic
+        Who else is on the move.
+    scans_us, turns_us : array, shape (n,), int64
+        Begin and duration of every radar turn [us].
+    sweeps_us : dict of str to array, shape (m,), int64
+        Begin of every turn of each lidar [us].
+    chosen : dict of str to array, shape (k,)
+        Which of these turns are written.
+    """
+
+    settings: VirtualSettings
+    name: str
+    town: Town | None
+    ground: Callable[[np.ndarray], np.ndarray]
+    scene: Scene
+    drive: Drive
+    traffic: Traffic
+    scans_us: np.ndarray
+    turns_us: np.ndarray
+    sweeps_us: dict[str, np.ndarray]
+    chosen: dict[str, np.ndarray]
+
+    @property
+    def first_mover(self) -> int:
+        """Object number of the first moving body."""
+        return int(self.scene.static_mesh.objects.max()) + 1
+
+    def generator(self, part: int, index: int = 0) -> np.random.Generator:
+        """Give the generator of one part of the session, such as one scan."""
+        return _generator(self.settings, self.name, part, index)
+
+    def scene_at(self, stamp_us: float, radius: float = 170.0) -> Scene:
+        """Give the town with everything that moves within a radius [m] where it is at one time [us]."""
+        middle = self.drive.pose(np.array([stamp_us]))[0]
+        return self.scene.with_moving(
+            self.traffic.meshes_at(self.ground, stamp_us, self.first_mover, middle, radius)
+        )
+
+
+def _generator(settings: VirtualSettings, name: str, part: int, index: int = 0) -> np.random.Generator:
+    return np.random.default_rng([settings.seed, settings.sessions[name].seed, part, index])
+
+
+def build_session(settings: VirtualSettings, name: str) -> VirtualSession:
+    """Build the town as one session finds it, and plan its drive.
+
+    Parameters
+    ----------
+    settings : VirtualSettings
+        The settings.
+    name : str
+        The session.
+
+    Returns
+    -------
+    session : VirtualSession
+        Ready for `make_scan` and `make_sweep`.
+
+    Raises
+    ------
+    SettingsError
+        If there is no such session.
+    """
+    from rol_sim.session import logs
+    from rol_sim.session.settings import describe
+    from rol_sim.world.scene import Scene
+
+    describe(settings, name)  # a clear error if there is no such session
+    own, rng = settings.sessions[name], partial(_generator, settings, name)
+    given = load_route(settings, own) if settings.world == "route" else None
+    n_scans = own.scans if given is None else len(given)
+    scans, turns = logs.schedule_scans(own.first_stamp_us, n_scans, rng(SCANS))
+    if given is None:
+        town, ground, mesh, drive, traffic = _find_town(settings, own, scans, turns, rng)
+    else:
+        town, ground = None, _flat
+        mesh, drive, traffic = _find_route(settings, own, given, scans + turns // 2, rng)
+    span = int(scans[0]) - 100_000, int(scans[-1] + turns[-1]) + 100_000
+    sweeps = {sensor: logs.schedule_sweeps(*span, rng(SWEEPS, k)) for k, sensor in enumerate(LIDARS)}
+    kind = own.sweeps or settings.sweeps
+    chosen = {sensor: logs.choose_sweeps(us, scans, turns, kind) for sensor, us in sweeps.items()}
+    return VirtualSession(
+        settings, name, town, ground, Scene(mesh), drive, traffic, scans, turns, sweeps, chosen
+    )
+
+
+def load_route(settings: VirtualSettings, own: SessionSettings) -> np.ndarray:
+    """Read the real poses that a session of the route is driven along.
+
+    Parameters
+    ----------
+    settings : VirtualSettings
+        Where the real data lie.
+    own : SessionSettings
+        The number of the pose file, the first scan and how many.
+
+    Returns
+    -------
+    poses : array, shape (n, 3)
+        Poses at mid-scan in the frame of the map.
+
+    Raises
+    ------
+    SettingsError
+        If the real data are not there, or the file holds too few poses.
+    """
+    from rol_data import rall
+    from rol_sim.session.settings import SettingsError
+
+    root = rall.find_real_root(settings.real_root)
+    if root is None:
+        raise SettingsError(
+            f"virtual: world: route: no real data in {settings.real_root or 'ROL_REAL_ROOT or data/real'}; "
+            "run `make real` or set ROL_REAL_ROOT"
+        )
+    path = root / rall.POSES_PATH / f"pose_xy_{own.poses}.txt"
+    poses = rall.load_poses(path)[own.first_scan :]
+    if len(poses) < max(own.scans, 3):
+        raise SettingsError(
+            f"{path}: {len(poses)} poses from scan {own.first_scan} on, {max(own.scans, 3)} are asked for"
+        )
+    return poses[: own.scans or None]
+
+
+def _find_town(
+    settings: VirtualSettings, own: SessionSettings, scans: np.ndarray, turns: np.ndarray, rng: Callable
+) -> tuple[Town, Callable[[np.ndarray], np.ndarray], Mesh, Drive, Traffic]:
+    """The town as one session finds it, and who is on the move."""
+    from rol_sim.drive.planned import build_route, plan_drive
+    from rol_sim.drive.traffic import plan_traffic
+    from rol_sim.world.mesh import merge_meshes
+    from rol_sim.world.town import dress
+
+    town = _build_town(settings.seed, settings.loop_m, settings.relief_m)
+    standing = dress(
+        town, rng(DRESS), parked_share=own.parked_share, leaf_density=own.leaf_density,
+        changed_share=own.changed_share,
+    )  # fmt: skip
+    route = build_route(town.plan)
+    duration_s = float(scans[-1] + turns[-1] - scans[0]) * 1e-6
+    drive = plan_drive(
+        route, int(scans[0]), duration_s, rng(DRIVE),
+        start_m=settings.start_m, cruise_mps=own.cruise_mps, n_stops=own.stops, stand_s=own.stand_s,
+    )  # fmt: skip
+    traffic = plan_traffic(
+        town.plan, route, drive, rng(TRAFFIC), n_vehicles=own.vehicles, n_people=own.people
+    )
+    return town, town.plan.ground, merge_meshes([town.mesh, standing]), drive, traffic
+
+
+def _find_route(
+    settings: VirtualSettings, own: SessionSettings, poses: np.ndarray, middles_us: np.ndarray, rng: Callable
+) -> tuple[Mesh, Drive, Traffic]:
+    """The world of the map as one session finds it, and who is on the move."""
+    from rol.maps import thin_points
+    from rol_data import rall
+    from rol_sim.drive.recorded import interpolate_drive, park_vehicles, plan_encounters
+    from rol_sim.world import mapped
+    from rol_sim.world.mesh import merge_meshes
+
+    places = thin_points(poses[:, :2], 2.0)[0]
+    path = str(rall.find_real_root(settings.real_root) / rall.MAP_PATH)
+    whole, unmapped = _read_map(path, settings.seed, settings.unmapped_share)
+    cells = mapped.crop_cells(whole, places, WORLD_RADIUS_M)
+    lane = thin_points(poses[:, :2], 0.5)[0]
+    later = mapped.change_cells(cells, rng(DRESS), missing_share=own.changed_share)
+    left = mapped.join_cells(
+        mapped.crop_cells(later, lane, WORLD_RADIUS_M, clear_m=CAR_M),  # the map keeps traces of traffic
+        mapped.crop_cells(unmapped, lane, WORLD_RADIUS_M, clear_m=CLEAR_M),
+    )
+    drive = interpolate_drive(middles_us, poses)
+    things = [
+        mapped.build_ground(places, WORLD_RADIUS_M),
+        mapped.build_pieces(left, settings.seed, leaf_density=own.leaf_density),
+    ]
+    parked = park_vehicles(
+        drive, cells.points, rng(DRIVE), parked_share=own.parked_share,
+        first_object=int(left.groups.max(initial=0)) + 1,
+    )  # fmt: skip
+    traffic = plan_encounters(drive, rng(TRAFFIC), vehicles_per_min=own.vehicles, people_per_min=own.people)
+    return merge_meshes([*things, parked]), drive, traffic
+
+
+def build_twins(real_root: Path | str, seed: int = 1, margin_s: float = 30.0) -> VirtualSession:
+    """Prepare virtual twins of the real scans whose poses on the real map are known.
+
+    The world is that of the route; the car drives through the poses of the scans, before and after them it goes on
+    as it went.
+
+    Parameters
+    ----------
+    real_root : path
+        Folder of the real data.
+    seed : int
+        Draws what the map does not tell: heights, changes since, vehicles, noise.
+    margin_s : float
+        For how long the car drives before the first and after the last scan [s].
+
+    Returns
+    -------
+    session : VirtualSession
+        Ready for `make_scan`; the stamps are those of the real scans. It has no sweeps.
+
+    Raises
+    ------
+    rall.RallError
+        If a file of the real data is missing or at fault.
+    """
+    from rol_data import rall
+    from rol_sim.session.settings import SessionSettings, VirtualSettings
+    from rol_sim.world.scene import Scene
+
+    known = rall.load_scan_poses(rall.find_scan_poses(real_root))
+    stamps, poses = np.array(list(known), dtype=np.int64), np.array(list(known.values()))
+    turns = np.full(len(stamps), 250_000, dtype=np.int64)
+    name = "virtual-twins"
+    own = SessionSettings(
+        "2019-01-10T14:37:26", len(stamps), seed, parked_share=0.15, vehicles=10, people=6, sweeps="none"
+    )
+    settings = VirtualSettings({name: own}, seed=seed, world="route", real_root=str(real_root))
+    rng = partial(_generator, settings, name)
+    before, after = np.arange(-margin_s, -0.1, 0.25), np.arange(0.25, margin_s, 0.25)
+    middles = stamps + turns // 2
+    mean_mps = np.hypot(*(poses[-1] - poses[0])[:2]) / ((middles[-1] - middles[0]) * 1e-6)
+    ends = [
+        np.column_stack([
+            pose[0] + mean_mps * seconds * np.cos(pose[2]), pose[1] + mean_mps * seconds * np.sin(pose[2]),
+            np.full(len(seconds), pose[2]),
+        ])
+        for pose, seconds in ((poses[0], before), (poses[-1], after))
+    ]  # fmt: skip
+    way = np.concatenate([ends[0], poses, ends[1]])
+    times = np.concatenate(
+        [middles[0] + (before * 1e6).astype(np.int64), middles, middles[-1] + (after * 1e6).astype(np.int64)]
+    )
+    mesh, drive, traffic = _find_route(settings, own, way, times, rng)
+    none: dict[str, np.ndarray] = {sensor: np.zeros(0, dtype=np.int64) for sensor in LIDARS}
+    return VirtualSession(settings, name, None, _flat, Scene(mesh), drive, traffic, stamps, turns, none, none)
+
+
+def _flat(places: np.ndarray) -> np.ndarray:
+    """Height of the land in a world grown from a map, which knows no heights."""
+    return np.zeros(len(places))
+
+
+@lru_cache(maxsize=1)
+def _read_map(path: str, seed: int, unmapped_share: float) -> tuple[Cells, Cells]:
+    """The map, and what stands there without being on it: the same for all sessions of a world."""
+    from rol_data import rall
+    from rol_sim.world.mapped import classify_cells, draw_unmapped
+
+    cells = classify_cells(rall.load_map_points(path))
+    return cells, draw_unmapped(cells, np.random.default_rng([seed, 0, 98]), share=unmapped_share)
+
+
+@lru_cache(maxsize=1)
+def _build_town(seed: int, loop_m: float, relief_m: float) -> Town:
+    from rol_sim.world.town import build_town
+
+    return build_town(np.random.default_rng([seed, 0, 99]), loop_length=loop_m, relief=relief_m)
+
+
+def make_scan(session: VirtualSession, index: int) -> RadarScan:
+    """Make one radar scan.
+
+    Parameters
+    ----------
+    session : VirtualSession
+        The session.
+    index : int
+        Which scan.
+
+    Returns
+    -------
+    scan : oxford.RadarScan
+        As `oxford.save_radar` takes it.
+    """
+    from rol.oxford import RadarScan
+    from rol_sim.sensors.radar import simulate_scan
+    from rol_sim.session import logs
+
+    stamp, turn, rng = (
+        int(session.scans_us[index]),
+        int(session.turns_us[index]),
+        session.generator(SCAN, index),
+    )
+    _, settings = sensor_settings(session.settings)
+    height = settings.height + float(session.ground(session.drive.pose(np.array([stamp]))[:, :2])[0])
+    times = logs.scan_row_times(stamp, turn)
+    middle = stamp + 0.5 * turn
+    bodies, _, velocities = session.traffic.bodies_at(
+        middle, session.drive.pose(np.array([middle]))[0], 170.0
+    )
+    moves = {session.first_mover + int(i): tuple(v) for i, v in zip(bodies, velocities, strict=True)}
+    codes = simulate_scan(
+        session.scene_at(middle),
+        session.drive.pose(times),
+        session.drive.velocity(times),
+        rng,
+        replace(settings, height=height),
+        moves,
+    )
+    counters = (FIRST_COUNT + COUNT_STEP * np.arange(logs.N_ROWS)).astype(np.uint16)
+    return RadarScan(
+        logs.draw_row_stamps(stamp, turn, rng), counters, np.full(logs.N_ROWS, 255, np.uint8), codes
+    )
+
+
+def make_sweep(session: VirtualSession, sensor: str, index: int) -> Sweep:
+    """Make one lidar sweep.
+
+    Parameters
+    ----------
+    session : VirtualSession
+        The session.
+    sensor : str
+        "velodyne_left" or "velodyne_right".
+    index : int
+        Which of the lidar's turns (a place in `sweeps_us`).
+
+    Returns
+    -------
+    sweep : Sweep
+        The raw file's content, and the true materials.
+    """
+    from rol.oxford import EXTRINSICS
+    from rol_sim.sensors.lidar import schedule_firings, simulate_sweep
+
+    rng = session.generator(SWEEP + LIDARS.index(sensor), index)
+    stamps, angles = schedule_firings(
+        int(session.sweeps_us[sensor][index]), rng, first_angle=float(rng.uniform(0.0, 0.006))
+    )
+    poses = session.drive.pose(stamps)
+    height = session.settings.radar_height_m + session.ground(poses[:1, :2])[0]
+    T_radar_lidar = np.linalg.inv(EXTRINSICS["radar"]) @ EXTRINSICS[sensor]
+    settings, _ = sensor_settings(session.settings)
+    scene = session.scene_at(float(stamps[len(stamps) // 2]), settings.max_range_m + 10.0)
+    return simulate_sweep(scene, stamps, angles, T_radar_lidar, poses, float(height), rng, settings)
+
+
+def label_sweep(folder: Path | str, sensor: str, stamp_us: int) -> tuple[np.ndarray, np.ndarray]:
+    """Give the points of a sweep and what each one hit, for the sweeps whose truth was written.
+
+    Parameters
+    ----------
+    folder : path
+        Folder of a virtual session.
+    sensor : str
+        "velodyne_left" or "velodyne_right".
+    stamp_us : int
+        The sweep's name [us].
+
+    Returns
+    -------
+    points : array, shape (n, 4), float32
+        As `oxford.velodyne_raw_to_points` gives them: x, y, z [m] in the lidar frame, intensity.
+    materials : array, shape (n,), uint8
+        `Material` of every point.
+
+    Raises
+    ------
+    ValueError
+        If the sweep has no labels or they do not fit; the message names the file.
+    """
+    import cv2
+
+    from rol.oxford import RANGE_UNIT, load_velodyne_raw, velodyne_raw_to_points
+
+    path = Path(folder) / "labels" / sensor / f"{stamp_us}.png"
+    labels = cv2.imread(str(path), cv2.IMREAD_UNCHANGED) if path.exists() else None
+    if labels is None:
+        raise ValueError(
+            f"{path}: missing or not an image; labels are there for some sweeps only, see list_labels"
+        )
+    raw = load_velodyne_raw(Path(folder) / sensor / f"{stamp_us}.png")
+    if labels.shape != raw.ranges.shape:
+        raise ValueError(f"{path}: shape {labels.shape} for a sweep of {raw.ranges.shape}")
+    points, _ = velodyne_raw_to_points(raw)
+    return points, labels.T[raw.ranges.T * RANGE_UNIT > 1.0]
+
+
+def list_labels(folder: Path | str, sensor: str) -> np.ndarray:
+    """List the sweeps of a virtual session whose true materials were written, shape (n,), int64 [us]."""
+    return np.array(
+        sorted(int(path.stem) for path in (Path(folder) / "labels" / sensor).glob("[!.]*.png")),
+        dtype=np.int64,
+    )
+
+
+def sensor_settings(settings: VirtualSettings) -> tuple[LidarSettings, RadarSettings]:
+    """Give the settings of both sensors, the usual ones where nothing else is asked for.
+
+    Parameters
+    ----------
+    settings : VirtualSettings
+        The settings of all sessions.
+
+    Returns
+    -------
+    lidar : LidarSettings
+        Of both lidars.
+    radar : RadarSettings
+        Of the radar, its height included.
+
+    Raises
+    ------
+    SettingsError
+        If a sensor has no such setting, or its value is out of its range.
+    """
+    from rol_sim.sensors.lidar import LidarSettings
+    from rol_sim.sensors.radar import RadarSettings
+
+    radar = {"height": settings.radar_height_m, **settings.radar}
+    return _fill(LidarSettings, settings.lidar, "lidar"), _fill(RadarSettings, radar, "radar")
+
+
+def _fill(kind: type, values: dict[str, Any], name: str) -> Any:
+    from rol_sim.session.settings import SettingsError
+
+    known = [f.name for f in fields(kind)]
+    unknown = sorted(set(values) - set(known))
+    if unknown:
+        raise SettingsError(f"virtual: {name}: unknown key {unknown[0]!r}; known are: {', '.join(known)}")
+    try:
+        return kind(
+            **{key: tuple(value) if isinstance(value, list) else value for key, value in values.items()}
+        )
+    except ValueError as error:
+        raise SettingsError(f"virtual: {name}: {error}") from error

@@ -1,0 +1,450 @@
+"""Statistics of radar scans, real or virtual: how bright, how noisy, how sharp, how regular they are.
+
+Every function takes the power codes of one scan, shape (400, 3768), or of several, shape (n, 400, 3768), and
+pools what it finds. The same numbers from real and from virtual scans, side by side, tell how near the
+simulator has come. Rows are azimuths and neighbours in time (the turn is not closed); columns are range bins.
+"""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+
+from rol.geometry import relative_pose
+
+BRIGHTNESS_CODES = (40, 60, 80, 100, 120)
+ZERO_RANGES_M = (3.0, 28.0, 41.0, 80.0, 106.0, 145.0)
+NEAR_RANGES_M = (0.0, 0.86, 2.0, 3.0)
+PEAK_EDGES = (0, 110, 130, 133, 256)
+MEASURED_RANGE_RESOLUTION = 0.0438  # bins are named by bin * resolution here, as the measured figures are
+QUIET_CODE = 30  # a piece of a row whose codes stay below this holds noise and little else
+FAR_BIN = 3000
+
+
+def forbidden_codes() -> np.ndarray:
+    """List the codes that no scan can hold, because the sensor's powers are integers.
+
+    Returns
+    -------
+    codes : array, shape (11,), uint8
+        1-5, 7, 8, 10, 11, 13, 16: what round(6.0206 (e + m)) skips for n = 2^e (1 + m) = 1, 2, 3, ...
+    """
+    mantissa, exponent = np.frexp(np.arange(1.0, 64.0))
+    reachable = np.round(20.0 * np.log10(2.0) * (exponent + 2.0 * mantissa - 2.0))
+    return np.setdiff1d(np.arange(24), reachable).astype(np.uint8)
+
+
+def brightness_shares(codes: np.ndarray, codes_from: tuple[int, ...] = BRIGHTNESS_CODES) -> dict[int, float]:
+    """Give the share of pixels at or above each code.
+
+    Parameters
+    ----------
+    codes : array, shape (..., 400, 3768), uint8
+        Scans.
+    codes_from : tuple of int
+        Codes to count from.
+
+    Returns
+    -------
+    shares : dict
+        Code -> share of all pixels [0..1].
+    """
+    counts = np.bincount(np.asarray(codes).ravel(), minlength=256)
+    tail = counts[::-1].cumsum()[::-1] / counts.sum()
+    return {code: float(tail[code]) for code in codes_from}
+
+
+def code_histogram(codes: np.ndarray) -> np.ndarray:
+    """Give the share of pixels of every code.
+
+    Parameters
+    ----------
+    codes : array, shape (..., 400, 3768), uint8
+        Scans.
+
+    Returns
+    -------
+    shares : array, shape (256,)
+        They sum to one.
+    """
+    counts = np.bincount(np.asarray(codes).ravel(), minlength=256)
+    return counts / counts.sum()
+
+
+def hellinger_distance(p: np.ndarray, q: np.ndarray) -> float:
+    """Give the distance of two histograms: 0 for equal ones, 1 for those without a common code.
+
+    Parameters
+    ----------
+    p, q : array, shape (n,)
+        Histograms that sum to one.
+
+    Returns
+    -------
+    distance : float
+        Root of one minus the sum of sqrt(p q).
+    """
+    return float(np.sqrt(max(0.0, 1.0 - np.sum(np.sqrt(np.asarray(p) * np.asarray(q))))))
+
+
+def zero_shares(codes: np.ndarray, ranges_m: tuple[float, ...] = ZERO_RANGES_M, half_bins: int = 15) -> dict:
+    """Give the share of code 0 in quiet bins at several ranges.
+
+    Parameters
+    ----------
+    codes : array, shape (..., 400, 3768), uint8
+        Scans.
+    ranges_m : tuple of float
+        Ranges, counted as bin * 0.0438 [m].
+    half_bins : int
+        Pieces of 2 * half_bins bins around a range are looked at; those that reach code 30 are left out.
+
+    Returns
+    -------
+    shares : dict
+        Range [m] -> share of zeros [0..1]; NaN where no piece is quiet.
+    """
+    scans = _rows(codes)
+    shares = {}
+    for range_m in ranges_m:
+        middle = round(range_m / MEASURED_RANGE_RESOLUTION)
+        piece = scans[:, max(middle - half_bins, 0) : middle + half_bins]
+        quiet = piece[piece.max(axis=1) < QUIET_CODE]
+        shares[range_m] = float((quiet == 0).mean()) if len(quiet) else float("nan")
+    return shares
+
+
+def noise_correlation(codes: np.ndarray, lags: int = 7, bins: tuple[int, int] = (700, 1100)) -> list[float]:
+    """Measure how alike the codes of quiet bins are along the range.
+
+    Parameters
+    ----------
+    codes : array, shape (..., 400, 3768), uint8
+        Scans.
+    lags : int
+        Greatest distance in bins.
+    bins : tuple of int
+        Range bins looked at; the quieter 30 % of the rows (by their greatest code there) are taken.
+
+    Returns
+    -------
+    correlation : list of float
+        Pearson correlation at lags 1..lags.
+    """
+    piece = _rows(codes)[:, slice(*bins)]
+    greatest = piece.max(axis=1)
+    quiet = piece[greatest <= np.percentile(greatest, 30)].astype(np.float64)
+    quiet -= quiet.mean(axis=1, keepdims=True)
+    power = float((quiet**2).mean())
+    return [
+        float((quiet[:, :-lag] * quiet[:, lag:]).mean() / max(power, 1e-12)) for lag in range(1, lags + 1)
+    ]
+
+
+def azimuth_correlation(codes: np.ndarray, bins: tuple[int, int] = (1500, 1900)) -> float:
+    """Measure how alike the noise of neighbouring azimuths is.
+
+    Parameters
+    ----------
+    codes : array, shape (..., 400, 3768), uint8
+        Scans.
+    bins : tuple of int
+        Range bins looked at; pairs of neighbours that are both among the quieter 30 % are taken.
+
+    Returns
+    -------
+    correlation : float
+        Pearson correlation of codes; NaN when no two quiet rows are neighbours.
+    """
+    scans = np.asarray(codes).reshape((-1,) + np.shape(codes)[-2:])[:, :, slice(*bins)]
+    greatest = scans.max(axis=2)
+    quiet = greatest <= np.percentile(greatest, 30)
+    both = quiet[:, :-1] & quiet[:, 1:]
+    if not both.any():
+        return float("nan")
+    return float(np.corrcoef(scans[:, :-1][both].ravel(), scans[:, 1:][both].ravel())[0, 1])
+
+
+def near_field(codes: np.ndarray, ranges_m: tuple[float, ...] = NEAR_RANGES_M) -> dict[float, float]:
+    """Give the mean code of the leakage close to the sensor.
+
+    Parameters
+    ----------
+    codes : array, shape (..., 400, 3768), uint8
+        Scans.
+    ranges_m : tuple of float
+        Ranges, counted as bin * 0.0438 [m].
+
+    Returns
+    -------
+    codes : dict
+        Range [m] -> mean code over all rows.
+    """
+    scans = _rows(codes)
+    return {r: float(scans[:, round(r / MEASURED_RANGE_RESOLUTION)].mean()) for r in ranges_m}
+
+
+def floor_by_peak(codes: np.ndarray, edges: tuple[int, ...] = PEAK_EDGES) -> dict[str, float]:
+    """Give the floor far out, for rows sorted by their strongest return.
+
+    Parameters
+    ----------
+    codes : array, shape (..., 400, 3768), uint8
+        Scans.
+    edges : tuple of int
+        Edges of the classes of the strongest code beyond bin 60.
+
+    Returns
+    -------
+    floors : dict
+        "low-high" -> median over the rows of the median code beyond bin 3000; NaN for an empty class.
+    """
+    scans = _rows(codes)
+    peaks, floors = scans[:, 60:].max(axis=1), np.median(scans[:, FAR_BIN:], axis=1)
+    classes = {}
+    for low, high in pairwise(edges):
+        inside = floors[(peaks >= low) & (peaks < high)]
+        classes[f"{low}-{high}"] = float(np.median(inside)) if len(inside) else float("nan")
+    return classes
+
+
+def point_spread(codes: np.ndarray, reach: tuple[int, int] = (5, 16)) -> dict[str, list[float]]:
+    """Measure how a strong point is smeared over azimuth and range.
+
+    Parameters
+    ----------
+    codes : array, shape (..., 400, 3768), uint8
+        Scans.
+    reach : tuple of int
+        How many rows and bins to each side.
+
+    Returns
+    -------
+    spread : dict
+        "azimuth_db" and "range_db": median level relative to the strongest cell at 0, 1, 2, ... rows or bins
+        away [dB], both sides pooled, over peaks of code 116 and more; empty lists when there is none.
+    """
+    rows_off, bins_off = reach
+    scans = np.asarray(codes).reshape((-1,) + np.shape(codes)[-2:]).astype(np.int16)
+    column = scans[:, :, 60:-bins_off].argmax(axis=2) + 60
+    azimuth, range_ = [], []
+    for scan, row in np.argwhere(scans[:, :, 60:-bins_off].max(axis=2) >= 116):
+        bin_ = column[scan, row]
+        if not rows_off <= row < scans.shape[1] - rows_off:
+            continue
+        across = scans[scan, row - rows_off : row + rows_off + 1, bin_]
+        if across.max() == across[rows_off]:
+            azimuth.append(across - across[rows_off])
+            range_.append(scans[scan, row, bin_ - bins_off : bin_ + bins_off + 1] - across[rows_off])
+    return {"azimuth_db": _fold(azimuth), "range_db": _fold(range_)}
+
+
+def motion_statistics(
+    codes: np.ndarray,
+    poses: np.ndarray,
+    *,
+    lag: int = 5,
+    scan_seconds: float = 0.25,
+    doppler_seconds: tuple[float, ...] = tuple(np.arange(-0.06, 0.1501, 0.01)),
+) -> dict:
+    """Measure what the car's motion does to scans: the turn is a spiral, and what comes nearer reads nearer.
+
+    Scans from places some metres apart are laid on each other by their known poses. What stood ahead of the one
+    stands abeam of the other, so a wrong range ahead shows; how well they agree says which correction is right.
+
+    Parameters
+    ----------
+    codes : array, shape (n, 400, 3768), uint8
+        Successive scans, all of them from a moving car; more than ``lag``.
+    poses : array, shape (n, 3)
+        Poses at mid-scan in any frame (x, y, yaw) [m, m, rad].
+    lag : int
+        Scan i is compared with scan i + lag.
+    scan_seconds : float
+        Time of a turn [s].
+    doppler_seconds : tuple of float
+        Doppler range shifts per closing speed to be tried [s].
+
+    Returns
+    -------
+    statistics : dict
+        "metres_per_turn": mean way; "correlation_raw", "correlation_motion", "correlation_both": mean
+        correlation of the Cartesian images of such pairs, uncorrected, with the motion during the turn taken
+        out, and with the best Doppler shift as well; "doppler_seconds": that shift [s], positive where what is
+        ahead reads nearer; "doppler_curve": correlation of every shift tried.
+    """
+    steps, ways = relative_pose(poses[:-1], poses[1:]), relative_pose(poses[:-lag], poses[lag:])
+    twists = np.vstack([steps, steps[-1:]]) / scan_seconds
+    curve = {float(shift): _mean_correlation(codes, ways, lag, twists, shift) for shift in doppler_seconds}
+    best = max(curve, key=curve.__getitem__)
+    return {
+        "metres_per_turn": float(np.hypot(steps[:, 0], steps[:, 1]).mean()),
+        "correlation_raw": _mean_correlation(codes, ways, lag, None, 0.0),
+        "correlation_motion": _mean_correlation(codes, ways, lag, twists, 0.0),
+        "correlation_both": curve[best],
+        "doppler_seconds": best,
+        "doppler_curve": curve,
+    }
+
+
+def _mean_correlation(
+    codes: np.ndarray, ways: np.ndarray, lag: int, twists: np.ndarray | None, doppler_seconds: float
+) -> float:
+    """Mean correlation of scans i and i + lag, as images of 0.25 m per pixel laid on each other."""
+    import cv2
+
+    from rol.radar import MEASURED_RANGE_OFFSET, polar_to_cartesian
+    from rol_sim.sensors.radar import beam_azimuths
+
+    azimuths = beam_azimuths()
+    width, pixel, found = 512, 0.25, []
+    middle = (width - 1) / 2.0
+    images = [
+        polar_to_cartesian(
+            scan, azimuths, range_resolution=MEASURED_RANGE_RESOLUTION, range_offset=MEASURED_RANGE_OFFSET,
+            pixel_size=pixel, width=width, twist=None if twists is None else twists[i],
+            doppler_seconds=doppler_seconds,
+        )
+        for i, scan in enumerate(codes)
+    ]  # fmt: skip
+    away = np.hypot(*(np.mgrid[:width, :width] - middle)) * pixel
+    own = np.where((away > 4.0) & (away < 50.0), np.float32(0.0), np.float32(np.nan))  # no leakage
+    for before, after, (x, y, yaw) in zip(images[:-lag], images[lag:], ways, strict=True):
+        # Column c and row r show the place (middle - r, middle - c) * pixel; both axes fall, so a turn stays one.
+        c, s = np.cos(yaw), np.sin(yaw)
+        forward = np.array([[c, s, 0.0], [-s, c, 0.0]])
+        forward[:, 2] = np.array([-y, -x]) / pixel + middle - forward[:, :2] @ (middle, middle)
+        moved = cv2.warpAffine(after + own, forward, (width, width), borderValue=np.nan)
+        seen = np.isfinite(moved + own)
+        found.append(np.corrcoef(before[seen], moved[seen])[0, 1])
+    return float(np.mean(found))
+
+
+def scan_statistics(codes: np.ndarray) -> dict:
+    """Measure all that one scan, or a few, can tell about its sensor.
+
+    Parameters
+    ----------
+    codes : array, shape (..., 400, 3768), uint8
+        Scans.
+
+    Returns
+    -------
+    statistics : dict
+        "histogram": share of every code; "shares": code -> share of pixels at or above it; "zero_shares": range [m] -> share of code 0 in quiet
+        bins; "range_correlation": of the noise at lags 1-7 bins; "azimuth_correlation"; "near_field": range
+        [m] -> mean code; "near_copies": True when bins 0-4 are identical; "floors": class of peak -> far
+        floor; "point_spread": levels [dB] by distance; "forbidden": number of pixels with a code that cannot
+        be; "greatest": greatest code; "shares_40_by_range": share of codes >= 40 by range, edges [m] as keys.
+
+    Raises
+    ------
+    ValueError
+        If the last two axes are not azimuths x range bins of a full scan or the type is not uint8.
+    """
+    codes = np.asarray(codes)
+    if codes.dtype != np.uint8 or codes.ndim < 2 or codes.shape[-1] < 3500:
+        raise ValueError(f"codes: expected uint8 of shape (..., 400, 3768), got {codes.dtype} {codes.shape}")
+    near = _rows(codes)[:, :5]
+    return {
+        "histogram": code_histogram(codes),
+        "shares": brightness_shares(codes),
+        "shares_40_by_range": shares_by_range(codes, 40),
+        "zero_shares": zero_shares(codes),
+        "range_correlation": noise_correlation(codes),
+        "azimuth_correlation": azimuth_correlation(codes),
+        "near_field": near_field(codes),
+        "near_copies": bool((near == near[:, :1]).all()),
+        "floors": floor_by_peak(codes),
+        "point_spread": point_spread(codes),
+        "forbidden": int(np.isin(codes, forbidden_codes()).sum()),
+        "greatest": int(codes.max()),
+    }
+
+
+def shares_by_range(
+    codes: np.ndarray, code: int, edges_m: tuple[float, ...] = (2.5, 5, 10, 20, 30, 50, 80, 110, 165)
+) -> dict:
+    """Give the share of pixels at or above a code, ring by ring.
+
+    Parameters
+    ----------
+    codes : array, shape (..., 400, 3768), uint8
+        Scans.
+    code : int
+        Code to count from.
+    edges_m : tuple of float
+        Edges of the rings, counted as bin * 0.0438 [m].
+
+    Returns
+    -------
+    shares : dict
+        "low-high" [m] -> share [0..1].
+    """
+    scans, bins = _rows(codes), [round(edge / MEASURED_RANGE_RESOLUTION) for edge in edges_m]
+    names = [f"{low:g}-{high:g}" for low, high in pairwise(edges_m)]
+    shares = [float((scans[:, low:high] >= code).mean()) for low, high in pairwise(bins)]
+    return dict(zip(names, shares, strict=True))
+
+
+def map_shares(
+    codes: np.ndarray,
+    poses: np.ndarray,
+    map_points: np.ndarray,
+    within_m: tuple[float, ...] = (1.0, 2.0),
+    *,
+    k: int = 12,
+    min_code: int = 70,
+    max_range_m: float = 64.0,
+) -> np.ndarray:
+    """Give the share of raw radar peaks that lie near a map point, scan by scan.
+
+    Parameters
+    ----------
+    codes : array, shape (n, 400, 3768), uint8
+        Scans.
+    poses : array, shape (n, 3)
+        Their poses in the map (x, y, yaw) [m, m, rad].
+    map_points : array, shape (m, 2)
+        Points of the map [m].
+    within_m : tuple of float
+        Distances [m].
+    k, min_code, max_range_m : int, int, float
+        The detector: strongest peaks per azimuth, weakest code, farthest range [m]; no network, no correction
+        of motion.
+
+    Returns
+    -------
+    shares : array, shape (n, len(within_m))
+        Share of the peaks of each scan; NaN for a scan without peaks.
+    """
+    from scipy.spatial import cKDTree
+
+    from rol.geometry import transform_points
+    from rol.radar import MEASURED_RANGE_OFFSET, k_strongest_peaks
+    from rol_sim.sensors.radar import beam_azimuths
+
+    tree, shares = cKDTree(map_points), []
+    for scan, pose in zip(codes, poses, strict=True):
+        peaks = k_strongest_peaks(
+            scan, beam_azimuths(), k, min_code, max_range_m=max_range_m,
+            range_resolution=MEASURED_RANGE_RESOLUTION, range_offset=MEASURED_RANGE_OFFSET,
+        )  # fmt: skip
+        gaps = tree.query(transform_points(pose, peaks))[0]
+        shares.append([float(np.mean(gaps < limit)) if len(gaps) else float("nan") for limit in within_m])
+    return np.array(shares)
+
+
+def _rows(codes: np.ndarray) -> np.ndarray:
+    return np.asarray(codes).reshape(-1, np.shape(codes)[-1])
+
+
+def _fold(profiles: list[np.ndarray]) -> list[float]:
+    """Median of both sides of profiles in half dB around their middle, in dB by distance from it."""
+    if not profiles:
+        return []
+    both = np.asarray(profiles)
+    middle = both.shape[1] // 2
+    folded = [np.median(both[:, [middle - k, middle + k]]) / 2.0 for k in range(middle + 1)]
+    return [float(level) for level in folded]

@@ -1,0 +1,374 @@
+"""Points as a front end of stated quality would give them, drawn from a lidar map at true poses: no radar, no network.
+
+The paper's front end is known by two numbers, the shares of its points within 1 m and 2 m of the lidar's (Sec. IV-B).
+Here every scan is a mixture of three kinds of points, mixed so that these two shares come out:
+
+- *near*: cells of the map that the radar could see from the true pose, with a small error;
+- *beside*: points between 1 m and 2 m off the map, as a front that is drawn too thick or twice;
+- *false*: anywhere within reach. Some are there once, some stand in the world for a while, some ride with the car.
+
+A map is full: of false points alone, about 30 % lie within 1 m of one of its points and 47 % within 2 m on the real route.
+So at the paper's shares no more than one point in six is true.
+
+All clouds are in the radar frame, x forward, y left [m].
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numba import prange
+from scipy.spatial import cKDTree
+
+from rol.compiled import compiled
+from rol.geometry import check_fields, check_grid, check_poses, invert, transform_points
+
+KINDS = ("near", "beside", "false")
+
+
+class MapPointsError(ValueError):
+    """Raised for a map or poses from which no points can be drawn, and for a quality that cannot be had."""
+
+
+@dataclass(frozen=True)
+class FrontEnd:
+    """What a front end's points are like.
+
+    Attributes
+    ----------
+    share_1m, share_2m : float
+        Shares of the points within 1 m and 2 m of a point of the map; 0.4 and 0.6 are the paper's (Sec. IV-B).
+    n_points : int
+        Points of a scan. The paper gives no number.
+    near_m : float
+        Standard deviation of a near point's error in x and in y [m].
+    persistent_share : float
+        Share of the false points that are seen again, half of them standing in the world, half riding with the car.
+    life_scans : float
+        How many scans such a point is seen on average.
+    min_range_m, max_range_m : float
+        Reach of the front end [m]; 64 m is the paper's.
+
+    Raises
+    ------
+    MapPointsError
+        If a value is out of its range; the message names it.
+    """
+
+    share_1m: float = 0.40
+    share_2m: float = 0.60
+    n_points: int = 400
+    near_m: float = 0.3
+    persistent_share: float = 0.5
+    life_scans: float = 8.0
+    min_range_m: float = 2.5
+    max_range_m: float = 64.0
+
+    def __post_init__(self) -> None:
+        allowed = {
+            "[0, 1]": "share_1m share_2m persistent_share",
+            "[0, inf)": "n_points near_m min_range_m",
+            "[1, inf)": "life_scans",
+            "(0, inf)": "max_range_m",
+        }
+        check_fields(self, allowed, MapPointsError)
+
+
+@dataclass(frozen=True)
+class Sight:
+    """What can be seen of a map from many poses.
+
+    Attributes
+    ----------
+    points : array of int16, shape (m, 2)
+        Seen cells in the frame of the radar that sees them [cm], one pose after the other.
+    starts : array of int64, shape (n + 1,)
+        Pose i has the points ``starts[i] : starts[i + 1]``.
+    """
+
+    points: np.ndarray
+    starts: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.starts) - 1
+
+    def __getitem__(self, index: int) -> np.ndarray:
+        """Give what pose `index` sees, shape (k, 2) [m]."""
+        return self.points[self.starts[index] : self.starts[index + 1]] * 0.01
+
+
+def look_around(
+    map_points: np.ndarray,
+    poses: np.ndarray,
+    *,
+    cell: float = 0.25,
+    max_range_m: float = 64.0,
+    n_beams: int = 400,
+    n_surfaces: int = 2,
+    depth_m: float = 1.0,
+) -> Sight:
+    """Find the cells of a map that beams from each pose reach before something stands in their way.
+
+    Parameters
+    ----------
+    map_points : array, shape (m, 2)
+        Points of the map [m].
+    poses : array, shape (n, 3)
+        Poses T_map_radar [m, m, rad].
+    cell : float
+        Side of a cell of the grid that is looked at [m].
+    max_range_m : float
+        Where a beam ends [m].
+    n_beams : int
+        Beams of a turn; 400 are the radar's azimuths.
+    n_surfaces : int
+        Surfaces that a beam shows before it is spent: a radar sees through the first bush.
+    depth_m : float
+        Cells of a beam closer together than this belong to one surface [m].
+
+    Returns
+    -------
+    sight : Sight
+        Middles of the cells seen, each once per pose.
+
+    Raises
+    ------
+    MapPointsError
+        If the map is empty, not finite or too large for a grid.
+    """
+    map_points, poses = np.asarray(map_points, dtype=np.float64), check_poses(poses)
+    if len(map_points) == 0:
+        raise MapPointsError("the map holds no point")
+    if not np.isfinite(map_points).all():
+        raise MapPointsError("the map holds a point that is not finite")
+    corner = map_points.min(axis=0) - 0.5 * cell
+    shape = np.floor((map_points.max(axis=0) - corner) / cell) + 1
+    shape = check_grid(shape, map_points, "map", error=MapPointsError)
+    cells = np.floor((map_points - corner) / cell).astype(np.int64)
+    occupied = np.zeros(shape, dtype=np.uint8)
+    occupied[cells[:, 0], cells[:, 1]] = 1
+    places = np.column_stack([(poses[:, :2] - corner) / cell, poses[:, 2]])
+    reach, depth = max_range_m / cell, depth_m / cell
+    seen = [
+        _cast_all(occupied, part, n_beams, reach, n_surfaces, depth)
+        for part in np.array_split(places, max(len(places) // 500, 1))
+    ]
+    points = np.concatenate([np.concatenate(part) for part in seen]) * cell * 100.0
+    counts = [len(one) for part in seen for one in part]
+    return Sight(np.rint(points).astype(np.int16), np.cumsum([0, *counts]))
+
+
+@compiled
+def _cast(occupied, u0, v0, yaw, n_beams, reach, n_surfaces, depth):
+    """Cells seen from one place, in its own frame and in cells, shape (k, 2)."""
+    h, w = occupied.shape
+    hits = np.empty(n_beams * 2 * n_surfaces * (int(depth) + 2), dtype=np.int64)
+    n = 0
+    for beam in range(n_beams):
+        angle = 2.0 * np.pi * beam / n_beams
+        c, s = np.cos(angle), np.sin(angle)
+        surfaces, since, surface_at = 0, 1e9, 0.0
+        for step in range(1, int(2 * reach)):
+            r = 0.5 * step
+            since += 0.5
+            i, j = int(np.floor(u0 + r * c)), int(np.floor(v0 + r * s))
+            if i < 0 or j < 0 or i >= h or j >= w or occupied[i, j] == 0:
+                continue
+            if since > depth:
+                surfaces, surface_at = surfaces + 1, r
+                if surfaces > n_surfaces:
+                    break
+            since = 0.0
+            if r - surface_at < depth and n < len(hits):
+                hits[n] = i * w + j
+                n += 1
+    cells = np.unique(hits[:n])
+    points = np.empty((len(cells), 2))
+    c, s = np.cos(yaw), np.sin(yaw)
+    for k in range(len(cells)):
+        u, v = cells[k] // w + 0.5 - u0, cells[k] % w + 0.5 - v0
+        points[k, 0], points[k, 1] = c * u + s * v, c * v - s * u
+    return points
+
+
+@compiled(parallel=True)
+def _cast_all(occupied, places, n_beams, reach, n_surfaces, depth):
+    """Do this from many places."""
+    seen = [np.empty((0, 2))] * len(places)
+    for k in prange(len(places)):
+        u, v, yaw = places[k]
+        seen[k] = _cast(occupied, u, v, yaw, n_beams, reach, n_surfaces, depth)
+    return seen
+
+
+def mix_kinds(shares: np.ndarray, share_1m: float, share_2m: float) -> np.ndarray:
+    """Find how to mix the three kinds of points so that two shares come out.
+
+    Parameters
+    ----------
+    shares : array, shape (2, 3)
+        Share of the points of each kind (columns: near, beside, false) within 1 m (first row) and 2 m of the map.
+    share_1m, share_2m : float
+        What the mixture is to have.
+
+    Returns
+    -------
+    weights : array, shape (3,)
+        Parts of the kinds, in 0..1, their sum 1.
+
+    Raises
+    ------
+    MapPointsError
+        If no mixture has these shares.
+    """
+    weights = np.linalg.solve(np.vstack([shares, np.ones(3)]), [share_1m, share_2m, 1.0])
+    if (weights < -1e-9).any():
+        told = ", ".join(f"{kind} {weight:.2f}" for kind, weight in zip(KINDS, weights, strict=True))
+        raise MapPointsError(
+            f"no mixture of points has {share_1m:.2f} within 1 m and {share_2m:.2f} within 2 m here: it would need {told}"
+        )
+    return np.clip(weights, 0.0, 1.0)
+
+
+def measure_kinds(
+    map_points: np.ndarray,
+    poses: np.ndarray,
+    sight: Sight,
+    front_end: FrontEnd,
+    rng: np.random.Generator,
+    n_scans: int = 100,
+) -> np.ndarray:
+    """Measure how many points of each kind lie near the map, by drawing some at a sample of the poses.
+
+    Parameters
+    ----------
+    map_points : array, shape (m, 2)
+        Points of the map [m].
+    poses : array, shape (n, 3)
+        Poses T_map_radar [m, m, rad].
+    sight : Sight
+        What these poses see.
+    front_end : FrontEnd
+        Errors and reach.
+    rng : numpy.random.Generator
+        Source of randomness.
+    n_scans : int
+        Poses of the sample, evenly chosen.
+
+    Returns
+    -------
+    shares : array, shape (2, 3)
+        For `mix_kinds`.
+
+    Raises
+    ------
+    MapPointsError
+        If none of these poses sees anything of the map.
+    """
+    tree, found = cKDTree(map_points), []
+    for index in np.linspace(0, len(poses) - 1, min(n_scans, len(poses))).astype(int):
+        if len(sight[index]):
+            clouds = _draw_near(sight[index], 300, front_end, rng), _draw_anywhere(300, front_end, rng)
+            near, false = (tree.query(transform_points(poses[index], cloud))[0] for cloud in clouds)
+            found.append(
+                [
+                    [np.mean(near < 1.0), 0.0, np.mean(false < 1.0)],
+                    [np.mean(near < 2.0), 1.0, np.mean(false < 2.0)],
+                ]
+            )
+    if not found:
+        raise MapPointsError("nothing of the map can be seen from any of the poses")
+    return np.mean(found, axis=0)
+
+
+def draw_clouds(
+    map_points: np.ndarray,
+    poses: np.ndarray,
+    sight: Sight,
+    front_end: FrontEnd,
+    rng: np.random.Generator,
+    parts: np.ndarray | None = None,
+) -> Iterator[np.ndarray]:
+    """Draw the cloud of each scan of a drive, one after the other.
+
+    Parameters
+    ----------
+    map_points : array, shape (m, 2)
+        Points of the map [m].
+    poses : array, shape (n, 3)
+        True poses T_map_radar [m, m, rad].
+    sight : Sight
+        What these poses see.
+    front_end : FrontEnd
+        Shares, number of points, errors, reach, and how false points last.
+    rng : numpy.random.Generator
+        Source of randomness.
+    parts : array, shape (3,), optional
+        Parts of the three kinds, from `mix_kinds`. Without them they are found at these poses; for a piece of a drive
+        give those of the whole, or a dense place, where false points lie near the map by chance, would get hardly a
+        true one.
+
+    Yields
+    ------
+    cloud : array, shape (k, 2)
+        Points in the radar frame [m], about ``n_points``; where less of the map is seen than near points are asked
+        for, only what is seen.
+
+    Raises
+    ------
+    MapPointsError
+        If the shares cannot be had on this map, see `mix_kinds`.
+    """
+    if parts is None:
+        kinds = measure_kinds(map_points, poses, sight, front_end, rng)
+        parts = mix_kinds(kinds, front_end.share_1m, front_end.share_2m)
+    near, beside, false = (parts * front_end.n_points).round().astype(int)
+    n_kept = round(false * front_end.persistent_share)
+    standing, riding, tree = np.zeros((0, 2)), np.zeros((0, 2)), cKDTree(map_points)
+    for index, pose in enumerate(poses):
+        seen = sight[index]
+        standing = _renew(standing, pose, n_kept - n_kept // 2, front_end, rng)
+        riding = _renew(riding, np.zeros(3), n_kept // 2, front_end, rng)
+        again = np.concatenate([transform_points(invert(pose), standing), riding])
+        yield np.concatenate([
+            _draw_near(seen, near, front_end, rng),
+            _draw_beside(seen, beside, pose, tree, rng),
+            again + rng.normal(0.0, 0.1, again.shape),
+            _draw_anywhere(false - n_kept, front_end, rng),
+        ])  # fmt: skip
+
+
+def _draw_near(seen: np.ndarray, n: int, front_end: FrontEnd, rng: np.random.Generator) -> np.ndarray:
+    """Some of the cells seen, each with a small error."""
+    chosen = rng.permutation(len(seen))[:n]
+    return seen[chosen] + rng.normal(0.0, front_end.near_m, (len(chosen), 2))
+
+
+def _draw_beside(
+    seen: np.ndarray, n: int, pose: np.ndarray, tree: cKDTree, rng: np.random.Generator
+) -> np.ndarray:
+    """Points about cells seen that lie between 1 m and 2 m off the map."""
+    if len(seen) == 0:
+        return np.zeros((0, 2))
+    tried = seen[rng.integers(len(seen), size=12 * n)] + rng.normal(0.0, 2.0, (12 * n, 2))
+    away = tree.query(transform_points(pose, tried), distance_upper_bound=2.0)[0]
+    return tried[(away >= 1.0) & (away < 2.0)][:n]
+
+
+def _draw_anywhere(n: int, front_end: FrontEnd, rng: np.random.Generator) -> np.ndarray:
+    """Points in any direction at any range, as dense along a beam near as far."""
+    ranges = rng.uniform(front_end.min_range_m, front_end.max_range_m, n)
+    angles = rng.uniform(-np.pi, np.pi, n)
+    return np.column_stack([ranges * np.cos(angles), ranges * np.sin(angles)])
+
+
+def _renew(
+    points: np.ndarray, T_frame_radar: np.ndarray, n: int, front_end: FrontEnd, rng: np.random.Generator
+) -> np.ndarray:
+    """Let lasting false points die at random or out of reach, and make up their number with new ones."""
+    ranges = np.hypot(*(points - T_frame_radar[:2]).T)
+    lives = (rng.random(len(points)) < 1.0 - 1.0 / front_end.life_scans) & (ranges < front_end.max_range_m)
+    fresh = _draw_anywhere(n - int(lives.sum()), front_end, rng)
+    return np.concatenate([points[lives], transform_points(T_frame_radar, fresh)])

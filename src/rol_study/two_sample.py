@@ -1,0 +1,200 @@
+"""The hard test of a simulator: can a classifier tell its scans from real ones?
+
+A small convolutional network looks at patches of 16 azimuths x 64 range bins and says "real" or "virtual". It
+learns on some scans and is judged on others. An area under the curve of 0.5 means that it cannot tell, 1 that
+it always can. `give_aways` says where it can.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+
+ROWS, BINS = 16, 64  # size of a patch
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What a classifier found on scans that it had not learnt from.
+
+    Attributes
+    ----------
+    auc : float
+        Area under the curve over all patches.
+    fold_aucs : array, shape (folds,)
+        The same for each group of scans left out.
+    scores : array, shape (2, n, 25, 58)
+        Score of each patch ("real" is high), of real and of virtual scans, by scan, azimuth and range.
+    """
+
+    auc: float
+    fold_aucs: np.ndarray
+    scores: np.ndarray
+
+
+def cut_patches(codes: np.ndarray) -> np.ndarray:
+    """Cut scans into patches that do not overlap.
+
+    Parameters
+    ----------
+    codes : array, shape (n, 400, 3768), uint8
+        Scans.
+
+    Returns
+    -------
+    patches : array, shape (n, 25, 58, 16, 64), uint8
+        By scan, azimuth and range; what does not fill a patch at the far end is left out.
+    """
+    n, rows, bins = len(codes), codes.shape[1] // ROWS, codes.shape[2] // BINS
+    cut = codes[:, : rows * ROWS, : bins * BINS].reshape(n, rows, ROWS, bins, BINS)
+    return np.ascontiguousarray(cut.transpose(0, 1, 3, 2, 4))
+
+
+def area_under_curve(real: np.ndarray, virtual: np.ndarray) -> float:
+    """Give the chance that a real patch scores higher than a virtual one; ties count half.
+
+    Parameters
+    ----------
+    real, virtual : array, any shape
+        Scores.
+
+    Returns
+    -------
+    auc : float
+        Between 0 and 1; 0.5 if the scores tell nothing.
+    """
+    from scipy.stats import rankdata
+
+    real, virtual = np.ravel(real), np.ravel(virtual)
+    ranks = rankdata(np.concatenate([real, virtual]))[: len(real)]
+    return float((ranks.sum() - 0.5 * len(real) * (len(real) + 1)) / (len(real) * len(virtual)))
+
+
+def tell_apart(
+    real: np.ndarray,
+    virtual: np.ndarray,
+    rng: np.random.Generator,
+    *,
+    folds: int = 3,
+    epochs: int = 4,
+    bf16: bool = False,
+) -> Verdict:
+    """Train classifiers on some scans and judge them on the others.
+
+    Parameters
+    ----------
+    real, virtual : array, shape (n, 400, 3768), uint8
+        Scans; scan i of the one and scan i of the other are always on the same side of the split, so that a
+        place that both show helps neither.
+    rng : numpy.random.Generator
+        Draws first weights and the order of the patches.
+    folds : int
+        Groups of neighbouring scans; each is left out once and judged by a network trained on the others.
+    epochs : int
+        Passes over the patches.
+    bf16 : bool
+        Multiply in bfloat16, see `rol.pix2pix.has_bf16`; takes half the time there.
+
+    Returns
+    -------
+    verdict : Verdict
+
+    Raises
+    ------
+    ValueError
+        If there are not as many real as virtual scans, or fewer scans than groups.
+    """
+    if len(real) != len(virtual) or not 2 <= folds <= len(real):
+        raise ValueError(f"{len(real)} real and {len(virtual)} virtual scans cannot be split into {folds}")
+    patches = np.stack([cut_patches(real), cut_patches(virtual)])
+    scores, aucs = np.empty(patches.shape[:4]), []
+    for left_out in np.array_split(np.arange(len(real)), folds):
+        learnt = np.setdiff1d(np.arange(len(real)), left_out)
+        classifier = _train(patches[:, learnt], rng, epochs, bf16)
+        scores[:, left_out] = _score(classifier, patches[:, left_out], bf16)
+        aucs.append(area_under_curve(*scores[:, left_out]))
+    return Verdict(area_under_curve(*scores), np.array(aucs), scores)
+
+
+def give_aways(verdict: Verdict, real: np.ndarray, virtual: np.ndarray) -> dict[str, dict[str, float]]:
+    """Say by what patches the classifier tells the two apart.
+
+    Parameters
+    ----------
+    verdict : Verdict
+        From `tell_apart`.
+    real, virtual : array, shape (n, 400, 3768), uint8
+        The scans that it was made from.
+
+    Returns
+    -------
+    aucs : dict
+        "range": area under the curve of patches by range "low-high" [m]; "brightest": by the brightest code
+        in the patch. 0.5 where it cannot tell.
+    """
+    from rol_study.radar_statistics import MEASURED_RANGE_RESOLUTION
+
+    peaks = np.stack([cut_patches(real), cut_patches(virtual)]).max(axis=(-1, -2))
+    range_m = np.broadcast_to(
+        (np.arange(peaks.shape[3]) + 0.5) * BINS * MEASURED_RANGE_RESOLUTION, peaks.shape
+    )
+    found: dict[str, dict[str, float]] = {}
+    cases = (
+        ("range", range_m, (0, 3, 10, 25, 50, 80, 110, 170)),
+        ("brightest", peaks, (0, 24, 34, 50, 70, 90, 256)),
+    )
+    for name, values, edges in cases:
+        found[name] = {}
+        for low, high in pairwise(edges):
+            inside = (values >= low) & (values < high)
+            if inside[0].any() and inside[1].any():
+                auc = area_under_curve(verdict.scores[0][inside[0]], verdict.scores[1][inside[1]])
+                found[name][f"{low}-{high}"] = auc
+    return found
+
+
+def _train(patches: np.ndarray, rng: np.random.Generator, epochs: int, bf16: bool):
+    """A network of 3 convolutions, trained by Adam; `patches` has shape (2, n, rows, bins, 16, 64)."""
+    import torch
+    from torch import nn
+
+    torch.manual_seed(int(rng.integers(2**31)))
+    classifier = nn.Sequential(
+        nn.Conv2d(1, 16, 5, padding=2), nn.MaxPool2d(2), nn.ReLU(),  # on a quarter of the values
+        nn.Conv2d(16, 32, 3, padding=1), nn.MaxPool2d(2), nn.ReLU(),
+        nn.Conv2d(32, 48, 3, padding=1), nn.ReLU(), nn.AdaptiveAvgPool2d(1), nn.Flatten(),
+        nn.Linear(48, 32), nn.ReLU(), nn.Linear(32, 1),
+    ).to(memory_format=torch.channels_last)  # fmt: skip
+    flat = patches.reshape(2, -1, 1, ROWS, BINS)
+    images = torch.from_numpy(flat.reshape(-1, 1, ROWS, BINS))
+    labels = torch.cat([torch.ones(flat.shape[1]), torch.zeros(flat.shape[1])])
+    optimiser = torch.optim.Adam(classifier.parameters(), lr=1e-3)
+    n_batches = -(-len(images) // 256)
+    schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, 3e-3, total_steps=epochs * n_batches)
+    for _ in range(epochs):
+        for batch in np.array_split(rng.permutation(len(images)), n_batches):
+            with torch.autocast("cpu", torch.bfloat16, enabled=bf16):
+                logits = classifier(_scale(images[batch]))[:, 0]
+            loss = nn.functional.binary_cross_entropy_with_logits(logits.float(), labels[batch])
+            optimiser.zero_grad()
+            loss.backward()
+            optimiser.step()
+            schedule.step()
+    return classifier.eval()
+
+
+def _score(classifier, patches: np.ndarray, bf16: bool) -> np.ndarray:
+    import torch
+
+    images = torch.from_numpy(patches.reshape(-1, 1, ROWS, BINS))
+    with torch.no_grad(), torch.autocast("cpu", torch.bfloat16, enabled=bf16):
+        scores = [classifier(_scale(part))[:, 0].float() for part in images.split(2048)]
+    return torch.cat(scores).numpy().reshape(patches.shape[:4])
+
+
+def _scale(images):
+    import torch
+
+    return (images.float() / 32.0 - 0.5).contiguous(memory_format=torch.channels_last)

@@ -1,0 +1,254 @@
+"""The examples of the pages run as they stand, in a folder that holds nothing but the files which the page names.
+
+And the pages on symbols and on citing say what the code and the bibliography say.
+"""
+
+import ast
+import atexit
+import functools
+import importlib.metadata
+import json
+import os
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterable
+from pathlib import Path
+
+import pytest
+import yaml
+from packaging.requirements import Requirement
+
+import toolbox_pages
+
+ROOT = Path(__file__).resolve().parents[2]
+PACKAGE = ROOT / "src" / "rol"
+TAKE, OWN_RADAR = ROOT / "book" / "take.md", ROOT / "book" / "own_radar.md"
+EXAMPLES = toolbox_pages.read_examples(TAKE)
+# What the modules import, by the name that pip knows it by.
+PACKAGES = {
+    "numpy": "numpy", "scipy": "scipy", "numba": "numba", "pandas": "pandas", "torch": "torch",
+    "opencv-python-headless": "cv2", "safetensors": "safetensors", "matplotlib": "matplotlib",
+    "open3d-cpu": "open3d", "pyyaml": "yaml",
+}  # fmt: skip
+
+# Those with torch take turns in one process, for importing it takes longer than the examples do.
+GROUPS = [[name] for name, example in EXAMPLES.items() if "torch" not in example.packages]
+GROUPS.append([name for name, example in EXAMPLES.items() if "torch" in example.packages])
+END = "----- end of an example -----\n"
+# Runs `example.py` in each folder as `python example.py` would, with nothing installed but what lies in the first one.
+RUN_ALONE = """
+import os, runpy, sys
+sys.path.insert(0, sys.argv[1])
+for folder in sys.argv[3:]:
+    os.chdir(folder)
+    sys.path.insert(0, folder)
+    runpy.run_path("example.py", run_name="__main__")
+    print(end=sys.argv[2])
+    sys.path.remove(folder)
+    for name, module in list(sys.modules.items()):
+        if str(getattr(module, "__file__", "")).startswith(folder) or name.partition(".")[0] == "tools":
+            del sys.modules[name]
+"""
+
+
+def with_requirements(packages: Iterable[str]) -> set[str]:
+    """Add what these packages bring along when pip installs them; on other systems open3d has another name."""
+    found, left = set(), {name.lower() for name in packages}
+    while left:
+        name = left.pop()
+        found.add(name)
+        try:
+            wanted = [Requirement(line) for line in importlib.metadata.requires(name) or []]
+        except importlib.metadata.PackageNotFoundError:
+            continue
+        left |= {w.name.lower() for w in wanted if not w.marker or w.marker.evaluate({"extra": ""})} - found
+    return found
+
+
+@functools.cache
+def installed_alone(packages: frozenset[str]) -> Path:
+    """Make a folder in which these packages are installed, and no other, by links to where they are."""
+    folder = Path(tempfile.mkdtemp(prefix="only-"))
+    atexit.register(shutil.rmtree, folder)
+    for name in with_requirements(packages):
+        for distribution in importlib.metadata.distributions(name=name):
+            tops = {file.parts[0] for file in distribution.files or []} - {"..", "__pycache__"}
+            for top in tops:
+                link = folder / top
+                if not link.exists():
+                    link.symlink_to(Path(distribution.locate_file(top)))
+    return folder
+
+
+def run_examples(folders: Iterable[Path], packages: Iterable[str]) -> list[str]:
+    """Run examples where only some packages are installed, `rol` not among them, and give what each prints."""
+    site = installed_alone(frozenset(packages))
+    command = [sys.executable, "-I", "-S", "-c", RUN_ALONE, str(site), END, *map(str, folders)]
+    answer = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert answer.returncode == 0, answer.stdout + answer.stderr
+    assert answer.stderr == ""
+    return answer.stdout.split(END)[:-1]
+
+
+def copy_files(names: Iterable[str], folder: Path) -> None:
+    """Copy files of the package, or the folder `virtual`, without what is compiled of them."""
+    folder.mkdir(exist_ok=True)
+    for name in names:
+        if (PACKAGE / name).is_dir():
+            shutil.copytree(PACKAGE / name, folder / name, ignore=shutil.ignore_patterns("__pycache__"))
+        else:
+            shutil.copy(PACKAGE / name, folder)
+
+
+def code_blocks(page: Path, section: str) -> list[tuple[str, str]]:
+    """Give language and text of the code blocks of a section of the second level."""
+    text = page.read_text(encoding="utf-8").partition(f"\n## {section}\n")[2].partition("\n## ")[0]
+    return re.findall(r"^```(\w+)\n(.*?)^```$", text, re.MULTILINE | re.DOTALL)
+
+
+# ---- each file ------------------------------------------------------------------------------------------------
+
+
+def test_every_file_has_an_example() -> None:
+    files = {file.stem for file in PACKAGE.glob("[!.]*.py") if not file.name.startswith("__")}
+    assert set(EXAMPLES) == files | {"virtual"}
+
+
+@pytest.mark.parametrize("group", GROUPS, ids="-".join)
+def test_examples_run_with_what_the_page_names(group: list[str], tmp_path: Path) -> None:
+    for name in group:
+        own = name if (PACKAGE / name).is_dir() else f"{name}.py"
+        (tmp_path / name).mkdir()
+        is_in_folder = "from tools." in EXAMPLES[name].code
+        copy_files([own, *EXAMPLES[name].files], tmp_path / name / ("tools" if is_in_folder else ""))
+        (tmp_path / name / "example.py").write_text(EXAMPLES[name].code, encoding="utf-8")
+    packages = set.union(*(EXAMPLES[name].packages for name in group))
+    printed = run_examples([tmp_path / name for name in group], packages)
+    assert dict(zip(group, printed, strict=True)) == {name: EXAMPLES[name].printed for name in group}
+
+
+@pytest.mark.parametrize("name", EXAMPLES)
+def test_page_names_all_that_a_file_needs(name: str) -> None:
+    files, packages = follow_imports(PACKAGE / name if name == "virtual" else PACKAGE / f"{name}.py")
+    line = EXAMPLES[name].needs
+    named = {word for word in re.split(r"[\s,;.]+", re.sub(r"`[^`]*`", "", line)) if word in PACKAGES}
+    packages |= {"numpy"} if "torch" in packages else set()  # torch complains where it is not installed
+    assert {PACKAGES[word] for word in named} == packages & set(PACKAGES.values())
+    assert set(re.findall(r"`(\w+\.py)`", line)) == files
+
+
+def follow_imports(start: Path) -> tuple[set[str], set[str]]:
+    """Find the other files that a file, or those in a folder, import in turn, and all packages that they import."""
+    inside = sorted(start.rglob("[!.]*.py")) if start.is_dir() else [start]
+    left, seen, packages = list(inside), set(inside), set()
+    while left:
+        file = left.pop()
+        for level, module in runtime_imports(ast.parse(file.read_text(encoding="utf-8"))):
+            base = file.parents[level - 1] if level else file.parent
+            target = base / f"{module}.py"
+            if target.is_file() and target not in seen:
+                seen.add(target)
+                left.append(target)
+            elif not target.is_file() and not level:
+                packages.add(module)
+    return {file.name for file in seen - set(inside)}, packages
+
+
+def runtime_imports(node: ast.AST) -> list[tuple[int, str]]:
+    """List imports as levels of the folder (0: by name) and first names, without those for type checkers."""
+    found = []
+    for child in ast.iter_child_nodes(node):
+        if isinstance(child, ast.If) and ast.unparse(child.test) == "TYPE_CHECKING":
+            continue
+        if isinstance(child, ast.Import):
+            found += [(0, alias.name.partition(".")[0]) for alias in child.names]
+        elif isinstance(child, ast.ImportFrom):
+            names = [child.module] if child.module else [alias.name for alias in child.names]
+            found += [(child.level, name.partition(".")[0]) for name in names]
+        found += runtime_imports(child)
+    return found
+
+
+# ---- the longer ones ------------------------------------------------------------------------------------------
+
+
+def test_mcl_copied_into_an_empty_folder_localizes(tmp_path: Path) -> None:
+    blocks = dict(code_blocks(TAKE, "Localize in five lines"))
+    assert (
+        "{mcl,compiled,geometry}.py" in blocks["bash"] and "pip install numpy scipy numba" in blocks["bash"]
+    )
+    copy_files(["mcl.py", "compiled.py", "geometry.py"], tmp_path)
+    (tmp_path / "example.py").write_text(blocks["python"], encoding="utf-8")
+    [printed] = run_examples([tmp_path], {"numpy", "scipy", "numba"})
+    assert printed == blocks["text"]
+    mean, worst, by_odometry = map(float, re.findall(r"(\d+\.\d+) m", printed))
+    assert mean < 0.2 and worst < 0.5 < by_odometry
+
+
+def run_with_package(section: str, folder: Path) -> str:
+    """Run the script of a section of the page on radars of one's own, with the package `rol` at hand."""
+    blocks = dict(code_blocks(OWN_RADAR, section))
+    shutil.copytree(PACKAGE, folder / "rol", ignore=shutil.ignore_patterns("__pycache__"))
+    (folder / "example.py").write_text(blocks["python"], encoding="utf-8")
+    [printed] = run_examples([folder], PACKAGES.keys() - {"torch", "safetensors", "open3d-cpu", "matplotlib"})
+    assert printed == blocks["text"]
+    return printed
+
+
+def test_radar_of_ones_own_is_localized(tmp_path: Path) -> None:
+    error = re.search(r"(\d+\.\d+) m off", run_with_package("Localize on your map", tmp_path))
+    assert float(error[1]) < 0.3
+
+
+def test_session_of_ones_own_is_read_as_oxfords_and_aligned(tmp_path: Path) -> None:
+    printed = run_with_package("Write Oxford's files", tmp_path)
+    assert printed.splitlines()[0] == "[]"
+    for place in re.findall(r"(\d+\.\d+) m to the left", printed):
+        assert abs(float(place) - 20.0) <= 0.25
+    pytest.importorskip("papermill")
+    shutil.rmtree(tmp_path / "sessions/my-town/velodyne_right")  # one lidar is enough, as the page says
+    (tmp_path / "sessions/my-town/velodyne_right.timestamps").unlink()
+    words = shlex.split(dict(code_blocks(OWN_RADAR, "Write Oxford's files"))["bash"])
+    (tmp_path / "notebooks").mkdir()
+    shutil.copy(ROOT / words[1], tmp_path / "notebooks")
+    command = [sys.executable, "-m", *words]
+    environment = {**os.environ, "PYTHONPATH": str(ROOT / "src"), "MPLBACKEND": "Agg"}
+    answer = subprocess.run(
+        command, cwd=tmp_path, env=environment, capture_output=True, encoding="utf-8", check=False
+    )
+    assert answer.returncode == 0, answer.stderr
+    summary = json.loads(
+        (tmp_path / "build/my-town/alignment/my-town/summary.json").read_text(encoding="utf-8")
+    )
+    assert summary["n_aligned"] == summary["n_scans"] == 4
+
+
+# ---- symbols and citations ------------------------------------------------------------------------------------
+
+
+def test_names_in_the_list_of_symbols_stand_in_the_code() -> None:
+    rows = re.findall(r"^\| \$.*$", (ROOT / "book" / "symbols.md").read_text(encoding="utf-8"), re.MULTILINE)
+    files = [*PACKAGE.glob("[!.]*.py"), *(ROOT / "notebooks").glob("0*.ipynb")]
+    words = {word for file in files for word in re.findall(r"\w+", file.read_text(encoding="utf-8"))}
+    assert len(rows) > 40
+    for row in rows:
+        assert {name for name in re.findall(r"`\.?(\w+)(?:\(\))?`", row)} <= words, row
+
+
+def test_entries_for_citing_are_those_of_the_bibliography() -> None:
+    known = (ROOT / "book" / "references.bib").read_text(encoding="utf-8")
+    entries = re.findall(
+        r"^@.*?^}$", (ROOT / "book" / "cite.md").read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL
+    )
+    [book] = [entry for entry in entries if entry not in known]
+    assert len(entries) == 6
+    version = re.search(r'__version__ = "(.*)"', (PACKAGE / "__init__.py").read_text(encoding="utf-8"))[1]
+    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text(encoding="utf-8"))
+    assert citation["version"] == version and f"Version {version}" in book
+    assert citation["title"] in book and citation["authors"][0]["name"] in book
+    paper = citation["preferred-citation"]
+    assert paper["title"] in entries[0] and str(paper["year"]) in entries[0]

@@ -1,0 +1,89 @@
+"""A few real pairs teach a network about their radar, and leave it what it knew beyond the lidar's reach."""
+
+import copy
+
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch")
+
+from rol.pix2pix import build_generator, generate
+from rol_beyond.adapt import RealPair, adapt, draw_real_pair
+
+pytestmark = pytest.mark.torch
+AZIMUTHS = -2.0 * np.pi * np.arange(400) / 400
+SETTINGS = {"width": 64, "pixel_size": 1.0, "range_resolution": 0.1, "range_offset": 0.0}
+
+
+def make_pair(seed: int) -> RealPair:
+    """A wall at 10 m on the left, seen by both."""
+    rng = np.random.default_rng(seed)
+    codes = rng.integers(0, 40, (400, 400)).astype(np.uint8)
+    x = np.arange(-12.0, 12.0, 0.5)
+    wall = np.column_stack([x, np.full(len(x), 10.0)])
+    rows = (
+        np.rint(np.mod(-np.arctan2(wall[:, 1], wall[:, 0]), 2 * np.pi) / (2 * np.pi) * 400).astype(int) % 400
+    )
+    codes[rows, np.rint(np.hypot(*wall.T) / 0.1).astype(int)] = 200
+    return RealPair(codes, AZIMUTHS, wall)
+
+
+@pytest.fixture
+def generator() -> torch.nn.Module:
+    network = build_generator(4, 1, "unet", rng=torch.Generator().manual_seed(1)).eval()
+    network.image_size = (64, 64)
+    with torch.no_grad():  # running statistics that have never run: without this nothing comes through
+        for weight in network.parameters():
+            weight.mul_(6.0 if weight.dim() > 1 else 1.0)
+    return network
+
+
+def test_target_is_the_lidar_near_by_and_the_old_drawing_beyond(generator: torch.nn.Module) -> None:
+    pair = make_pair(0)
+    radar, lidar = draw_real_pair(generator, pair, 0.0, reach_m=15.0, threshold=100, settings=SETTINGS)
+    axis = 31.5 - np.arange(64)
+    ranges = np.hypot(axis[:, None], axis[None, :])
+    drawn = np.where(generate(generator, radar, headings=1) >= 100, 255, 0)
+    np.testing.assert_array_equal(lidar[ranges >= 15.0], drawn[ranges >= 15.0])
+    rows, columns = np.nonzero((lidar > 0) & (ranges < 15.0))
+    assert len(rows) > 10 and (np.abs(axis[columns] - 10.0) <= 0.5).all()  # y is to the left
+    turned = draw_real_pair(generator, pair, np.pi / 2, reach_m=15.0, threshold=100, settings=SETTINGS)[1]
+    rows, columns = np.nonzero((turned > 0) & (ranges < 15.0))
+    assert (np.abs(axis[rows] + 10.0) <= 0.5).all()  # a quarter turn to the left brings it behind
+
+
+def test_adapting_draws_the_wall_and_leaves_the_first_network_alone(generator: torch.nn.Module) -> None:
+    pairs, before = [make_pair(seed) for seed in range(3)], copy.deepcopy(generator.state_dict())
+    options = {"reach_m": 25.0, "steps": 40, "batch": 2, "learning_rate": 5e-3, "settings": SETTINGS}
+    adapted = adapt(generator, pairs, np.random.default_rng(1), **options)
+    assert all(torch.equal(value, before[name]) for name, value in generator.state_dict().items())
+    radar, lidar = draw_real_pair(
+        generator, make_pair(9), 1.0, reach_m=25.0, threshold=150, settings=SETTINGS
+    )
+    contrast = [
+        generate(network, radar)[lidar > 0].mean() - generate(network, radar)[lidar == 0].mean()
+        for network in (generator, adapted)
+    ]
+    assert contrast[1] > contrast[0] + 30
+    again = adapt(generator, pairs, np.random.default_rng(1), **options)
+    np.testing.assert_array_equal(generate(again, radar), generate(adapted, radar))
+
+
+def test_adapting_in_bf16_rounds_a_little(generator: torch.nn.Module) -> None:
+    options = {"reach_m": 25.0, "steps": 1, "batch": 2, "settings": SETTINGS}
+    pairs = [make_pair(seed) for seed in range(2)]
+    plain, rounded = (
+        torch.cat(
+            [
+                w.flatten()
+                for w in adapt(generator, pairs, np.random.default_rng(1), bf16=bf16, **options).parameters()
+            ]
+        )
+        for bf16 in (False, True)
+    )
+    assert 0.0 < (plain - rounded).abs().max() < 1e-3
+
+
+def test_nothing_to_learn_from_is_refused(generator: torch.nn.Module) -> None:
+    with pytest.raises(ValueError, match="no real pairs"):
+        adapt(generator, [], np.random.default_rng(1), reach_m=20.0)

@@ -1,0 +1,62 @@
+"""The networks that come with the book: whole, small, with a card that fits, and as good as it says on real scans."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial import cKDTree
+
+pytest.importorskip("torch")
+from safetensors import safe_open
+
+from rol_beyond.front_ends import detect_points, judge_on_map, load_translator, translate_scan
+from rol_data import rall
+
+pytestmark = pytest.mark.torch
+WEIGHTS = sorted((Path(__file__).resolve().parents[2] / "data" / "weights").glob("*.safetensors"))
+
+
+@pytest.mark.parametrize("path", WEIGHTS, ids=lambda path: path.stem)
+def test_weights_are_small_and_have_a_card_that_fits(path: Path) -> None:
+    assert path.stat().st_size < 25e6
+    card, translator = (
+        json.loads(path.with_suffix(".json").read_text(encoding="utf-8")),
+        load_translator(path),
+    )
+    assert translator.about["card"] == path.with_suffix(".json").name and card["name"] == path.stem
+    assert translator.points == {"threshold": card["threshold"], "thin": card["thin"]}
+    assert translator.generator.headings == card["headings"] == card["recipe"]["network"].get("headings", 1)
+    assert translator.settings == card["recipe"]["pairs"]
+    for key, value in card["recipe"]["network"].items():
+        if key in translator.about["config"]:
+            assert translator.about["config"][key] == value, key
+    assert {"versions", "licence", "history", "judged", "pairs"} <= set(card)
+    with safe_open(path, "pt") as file:
+        kinds = {file.get_slice(name).get_dtype() for name in file.keys()}  # noqa: SIM118 (no mapping)
+    assert kinds <= {"F16", "I64"}
+
+
+def test_the_networks_that_chapters_use_are_there() -> None:
+    assert {"rol", "paper", "paper-no-gan"} <= {path.stem for path in WEIGHTS}
+
+
+def test_the_best_network_beats_raw_peaks_on_real_scans_as_its_card_says(real_root: Path) -> None:
+    path = next(path for path in WEIGHTS if path.stem == "rol")
+    translator, tree = load_translator(path), cKDTree(rall.load_map_points(real_root / rall.MAP_PATH))
+    rows = []
+    for scan in rall.load_scans(real_root)[::3]:
+        fake = translate_scan(translator, scan.codes, scan.azimuths, scan.twist)[0]
+        raw = detect_points(scan.codes, scan.azimuths, scan.twist)
+        rows.append([judge_on_map(points, scan.pose, tree)["share_1m"] for points in (fake, raw)])
+        assert len(fake) >= 300
+    fake_share, raw_share = np.mean(rows, axis=0)
+    judged = json.loads(path.with_suffix(".json").read_text(encoding="utf-8"))["judged"]
+    told = next(
+        share
+        for place, level, share in zip(
+            judged["places"], judged["threshold"], judged["fake_to_real_within_1m"], strict=True
+        )
+        if place == "real" and level == translator.points["threshold"]
+    )
+    assert fake_share > raw_share + 0.04 and fake_share == pytest.approx(told, abs=0.05)

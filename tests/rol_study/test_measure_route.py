@@ -1,0 +1,93 @@
+"""What the long measurement on the real route asks for, and how it keeps its tables."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pandas as pd
+import pytest
+
+import measure_route
+from rol_beyond.motion import MotionModel
+from rol_study.route import RouteRun, published_motion
+from rol_study.route_runs import Stage
+
+N = 30
+
+
+@pytest.fixture
+def asked(monkeypatch: pytest.MonkeyPatch) -> list[SimpleNamespace]:
+    """Note what each run is asked for, and give a run that is right."""
+    truth = np.column_stack([np.arange(N), np.zeros((N, 2))])
+    stage = Stage(
+        measure_route.Route("07", truth, np.diff(truth, axis=0)), np.zeros((9, 2)), measure_route.FrontEnd(),
+        None, None, published_motion(), "01", 0.05, None,
+    )  # fmt: skip
+    noted = []
+
+    def run(stage, method, clouds, seed, *, recovery=None, **changes) -> RouteRun:
+        noted.append(
+            SimpleNamespace(stage=stage, method=method, recovery=recovery, changes=changes, seed=seed)
+        )
+        spread = np.full((N, 3, 3), np.nan) if method == "registration" else np.tile(np.eye(3), (N, 1, 1))
+        return RouteRun(truth, spread, [], np.zeros(N, dtype=bool), np.ones(N), np.full(N, 100), np.ones(N))
+
+    monkeypatch.setattr(measure_route, "stage_of", lambda *a, **k: stage)
+    monkeypatch.setattr(measure_route, "draw_session", lambda stage, seed: [])
+    monkeypatch.setattr(measure_route, "run_method", run)
+    return noted
+
+
+def test_each_ingredient_changes_one_thing(asked: list) -> None:
+    for name in measure_route.INGREDIENTS:
+        (row,) = measure_route.measure_ingredients("", "07", name, 3)
+        assert row["without"] == name and row["seed"] == 3 and row["rmse_m"] == 0.0
+    found = {
+        name: (
+            made.changes,
+            made.stage.model == published_motion(),
+            np.isfinite(made.recovery.doubt) and np.isfinite(made.recovery.lost),
+            made.recovery.still_share,
+        )
+        for name, made in zip(measure_route.INGREDIENTS, asked, strict=True)
+    }
+    usual = found.pop("all of rol")
+    assert usual == ({}, True, True, 0.25) and {made.recovery.level for made in asked} == {0.05}
+    for name, given in found.items():
+        assert sum(a != b for a, b in zip(given, usual, strict=True)) == 1, name
+    assert not found["without recovery"][2]
+    assert found["standing scans count in full"][3] == 1.0
+    assert asked[list(measure_route.INGREDIENTS).index(measure_route.UNTAUGHT)].stage.model == MotionModel()
+
+
+def test_tuned_is_the_paper_with_the_best_of_the_swept_settings(asked: list) -> None:
+    for what in measure_route.TUNED:
+        (row,) = measure_route.measure_tuned("", "07", what, 2)
+        assert (row["what"], row["method"], row["failures"]) == (what, "tuned", 0)
+    both, narrow, quiet = (made.changes for made in asked)
+    assert {made.method for made in asked} == {"paper"} and both == narrow | quiet
+    assert narrow == {"d_th_m": min(value for _, value in measure_route.SETTINGS["d_th [m]"])}
+    factor = min(value for _, value in measure_route.SETTINGS["noise"])
+    usual = measure_route.settings_for("paper")
+    assert quiet == pytest.approx({name: factor * getattr(usual, name) for name in quiet}) and len(quiet) == 3
+
+
+def test_registration_has_a_row_without_a_covariance(asked: list) -> None:
+    (row,) = measure_route.measure_registration("", "07", 1)
+    assert asked[0].method == row["method"] == "registration"
+    assert row["rmse_m"] == 0.0 and "mean_nees" not in row
+    (other,) = measure_route.measure_ingredients("", "07", "all of rol", 1)
+    assert other["mean_nees"] == 0.0
+
+
+def test_settings_are_not_judged_where_they_were_chosen() -> None:
+    jobs = measure_route.list_tuned(["01", "02", "07"])
+    assert {number for number, _, _ in jobs} == {"01", "07"} and len(set(jobs)) == len(jobs) == 18
+
+
+def test_a_kept_table_is_no_more_and_no_less_than_the_jobs() -> None:
+    for what, key in (("tuned", "what"), ("registration", "session"), ("ingredients", "without")):
+        path = measure_route.ROOT / "data" / "ablations" / f"route_{what}.csv"
+        table = pd.read_csv(path, dtype={"session": str})
+        assert not table.job.duplicated().any() and table[key].notna().all()
+    ingredients = table.groupby("without").seed.nunique()
+    assert set(ingredients.index) == set(measure_route.INGREDIENTS) and (ingredients >= 3).all()
