@@ -5,8 +5,8 @@
 #   snakemake -c2 -n                                  only say what would run, and why
 #
 # A run is out of date when the code it uses, its parameters or its inputs changed. Code means the notebook's code cells
-# and the modules of src/rol that it imports, without comments and docstrings: they enter as a digest in `params`, so
-# editing a text reruns no notebook (the book takes the new text all the same).
+# and the modules under src that it imports, without comments and docstrings, and the versions in requirements.lock: they
+# enter as a digest in `params`, so editing a text reruns no notebook (the book takes the new text all the same).
 
 import json
 import os
@@ -98,7 +98,7 @@ rule book:
         notebooks=[run.path(OUT) for run in RUNS],
         sources=[f"notebooks/{chapter}.ipynb" for chapter in chapters.CHAPTERS],
         pages=[str(path) for path in sorted(Path("book").rglob("[!.]*")) if path.is_file()],
-        modules=[str(path) for path in sorted(Path("src/rol").rglob("[!.]*.py"))],
+        modules=[str(path) for path in sorted(Path("src").rglob("[!.]*.py"))],
         stage=["workflow/stage_book.py", "workflow/toolbox_pages.py", "workflow/check.py"],
         reference=[str(path) for path in sorted(Path("data/reference").glob("[!.]*.json"))],
     output:
@@ -128,7 +128,7 @@ rule virtual_session:
         SESSIONS_ROOT + "/{session}.log",
     params:
         recipe=lambda wildcards: json.dumps(recipe(wildcards.session), sort_keys=True),
-        code=chapters.virtual_digest(),
+        code=chapters.simulator_digest(),
         made=SESSIONS_ROOT + "/{session}",
     message:
         "virtual session {wildcards.session}"
@@ -136,7 +136,7 @@ rule virtual_session:
         'made={params.made:q}; [ "$(cat "$made.code" 2>/dev/null)" = {params.code} ] '
         """|| ! grep -qs '"format":' "$made/settings.json" || rm -rf "$made"; """
         'echo {params.code} > "$made.code"; '
-        + ENVIRONMENT + "{PYTHON:q} -m rol_sim {CONFIG_FILE:q} --session {wildcards.session:q} --out {SESSIONS_ROOT:q} "
+        + ENVIRONMENT + "{PYTHON:q} -m {chapters.SIMULATOR} {CONFIG_FILE:q} --session {wildcards.session:q} --out {SESSIONS_ROOT:q} "
         "> {log:q} 2>&1 || {{ tail -n 30 {log:q}; exit 1; }}"
 
 

@@ -133,15 +133,13 @@ def test_binder_finds_what_the_button_needs() -> None:
 
 def test_metadata_files_of_macos_are_passed_over(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     package, pages = tmp_path / "src/rol", tmp_path / "book"
-    shutil.copytree(chapters.PACKAGE, package, ignore=shutil.ignore_patterns("__pycache__"))
+    shutil.copytree(ROOT / "src/rol", package, ignore=shutil.ignore_patterns("__pycache__"))
     shutil.copytree(ROOT / "book", pages, ignore=shutil.ignore_patterns("__pycache__"))
-    for folder, kind in itertools.product(
-        (package, package / "virtual", pages, pages / "images"), ("md", "py")
-    ):
+    for folder, kind in itertools.product((package, pages, pages / "images"), ("md", "py")):
         (folder / f"._x.{kind}").write_bytes(b"\0\5\x16\7\xff")
     monkeypatch.chdir(tmp_path)
-    for module in (chapters, toolbox_pages):
-        monkeypatch.setattr(module, "PACKAGE", package)
+    monkeypatch.setattr(chapters, "SOURCE", package.parent)
+    monkeypatch.setattr(toolbox_pages, "PACKAGE", package)
     monkeypatch.setattr(stage_book, "ROOT", tmp_path)
     for name in ("stage_notebooks", "stage_result_figure"):
         monkeypatch.setattr(stage_book, name, lambda *_: None)
