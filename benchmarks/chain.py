@@ -30,8 +30,8 @@ from rol import mcl
 from rol.files import write_text
 from rol.odometry import local_map_odometry
 from rol.oxford import load_radar, load_timestamps
-from rol.pix2pix import ResnetGenerator, has_bf16
-from rol_beyond.front_ends import Translator, detect_points, load_translator, translate_scan
+from rol.pix2pix import ResnetGenerator, TrainedNetwork, has_bf16, load_network
+from rol_beyond.front_ends import detect_points, translate_scan
 from rol_beyond.motion import MotionModel, mover
 from rol_book.parameters import positive
 from rol_data import rall
@@ -62,10 +62,10 @@ def list_front_ends(full_width: int = 64) -> dict[str, FrontEnd]:
     ends: dict[str, FrontEnd] = {"raw peaks": detect_points}
     weights = ROOT / "data" / "weights"
     for words, (name, headings) in NETWORKS.items():
-        ends[words] = translate(load_translator(weights / f"{name}.safetensors"), headings)
-    narrow = load_translator(weights / "paper.safetensors")
+        ends[words] = translate(load_network(weights / f"{name}.safetensors"), headings)
+    narrow = load_network(weights / "paper.safetensors")
     full = ResnetGenerator(full_width, blocks=9).eval()
-    wide = translate(Translator(full, narrow.points, narrow.settings, {}), 1)
+    wide = translate(TrainedNetwork(full, narrow.points, narrow.settings, {}), 1)
     ends["network paper, full width"] = lambda codes, azimuths: (
         wide(codes, azimuths),
         detect_points(codes, azimuths),
@@ -73,7 +73,7 @@ def list_front_ends(full_width: int = 64) -> dict[str, FrontEnd]:
     return ends
 
 
-def translate(translator: Translator, headings: int | None) -> FrontEnd:
+def translate(translator: TrainedNetwork, headings: int | None) -> FrontEnd:
     """A network as a front end."""
     made = partial(translate_scan, translator, bf16=has_bf16(), headings=headings)
     return lambda codes, azimuths: made(codes, azimuths)[0]

@@ -131,14 +131,15 @@ def judge(
 ) -> pd.DataFrame:
     """Judge a network on every set but the one it learnt from, and on the real scans against the real map."""
     from rol.bev import image_to_points
+    from rol.pix2pix import TrainedNetwork
     from rol.training import score_points
-    from rol_beyond.front_ends import MIN_RANGE_M, Translator, judge_on_map, translate_scan
+    from rol_beyond.front_ends import MIN_RANGE_M, judge_on_map, translate_scan
 
     tables = [
         score_points(generator, pairs, LEVELS, thin=thin).assign(places=name)
         for name, pairs in sets.items() if not name.startswith("learn")
     ]  # fmt: skip
-    rows, translator = [], Translator(generator, {}, settings, {})
+    rows, translator = [], TrainedNetwork(generator, {}, settings, {})
     for scan in [] if real is None else real[0]:
         _, _, fake = translate_scan(translator, scan.codes, scan.azimuths, scan.twist)
         for level in LEVELS:

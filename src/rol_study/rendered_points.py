@@ -1,4 +1,4 @@
-"""Clouds for the real route: the simulated radar at the true poses of a real session, through a translator.
+"""Clouds for the real route: the simulated radar at the true poses of a real session, through a network.
 
 The public data hold map, poses and odometry of the paper's sessions, but no scans. Here the scans are made: the world is
 grown from the real map, the simulated car drives through the real poses, and what its radar sees goes through the network.
@@ -16,7 +16,7 @@ import numpy as np
 from rol.geometry import relative_pose
 
 if TYPE_CHECKING:
-    from rol_beyond.front_ends import Translator
+    from rol.pix2pix import TrainedNetwork
     from rol_sim.session.assembly import SimulatedSession
 
 STREET = {"parked_share": 0.15, "vehicles": 10, "people": 6}  # as for the twins of the real scans
@@ -27,7 +27,7 @@ def render_clouds(
     number: str,
     first_scan: int,
     n_scans: int,
-    translator: Translator,
+    network: TrainedNetwork,
     seed: int,
     *,
     bf16: bool = False,
@@ -47,8 +47,8 @@ def render_clouds(
         Of the session, such as "02".
     first_scan, n_scans : int
         Where in ``pose_xy_<number>.txt`` the stretch begins, and how many scans it has: at least 3, or 0 for all that follow.
-    translator : Translator
-        From `rol_beyond.front_ends.load_translator`; threshold and thinning are its own.
+    network : TrainedNetwork
+        From `rol.pix2pix.load_network`; threshold and thinning are its own.
     seed : int
         Draws all that is simulated: the same seed, the same world for all sessions, each on a day of its own.
     bf16, headings
@@ -82,7 +82,7 @@ def render_clouds(
     surroundings of the eleven real scans and of one more place (``sets`` in its card). Clouds from there flatter it.
     """
     session = build_stretch(real_root, number, first_scan, n_scans, seed, **changes)
-    return _translate(session, translator, bf16=bf16, headings=headings)
+    return _translate(session, network, bf16=bf16, headings=headings)
 
 
 def build_stretch(
@@ -108,13 +108,13 @@ def build_stretch(
     return build_session(parse_settings(section, str(path)), name)
 
 
-def _translate(session: SimulatedSession, translator: Translator, **how: Any) -> Iterator[np.ndarray]:
+def _translate(session: SimulatedSession, network: TrainedNetwork, **how: Any) -> Iterator[np.ndarray]:
     from rol_beyond.front_ends import translate_scan
     from rol_sim.session.assembly import make_scan
 
     for index, twist in enumerate(true_twists(session)):
         scan = make_scan(session, index)
-        yield translate_scan(translator, scan.codes, scan.azimuths, tuple(twist), **how)[0]
+        yield translate_scan(network, scan.codes, scan.azimuths, tuple(twist), **how)[0]
 
 
 def true_twists(session: SimulatedSession) -> np.ndarray:
