@@ -98,7 +98,6 @@ def test_other_encodings_are_named(tmp_path: Path) -> None:
     [
         ("1.0 0 0 0 0 0 0 1\n2.0 0 0 0 0 0 0 1\n", lambda path: evaluation.read_tum(path)[1].shape),
         ("1 1\n2 1\n", lambda path: oxford.load_timestamps(path)[0].tolist()),
-        ("0 0 0 0 0 0\n", lambda path: oxford.load_extrinsics(path).tolist()),
         (
             ",".join(oxford.ODOMETRY_COLUMNS) + "\n375000,125000,1,0,0,0,0,0,250000,1\n",
             lambda path: oxford.load_radar_odometry(path).steps.tolist(),
