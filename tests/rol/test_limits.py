@@ -9,7 +9,7 @@ from pathlib import Path
 PACKAGE = Path(__file__).resolve().parents[2] / "src" / "rol"
 FILES = sorted(PACKAGE.rglob("[!.]*.py"))
 MAX_LINES, MAX_FILE_LINES, MAX_PARAMETERS, MAX_FIELDS = 2600, 400, 7, 12
-LAYOUT = {getattr(tokenize, name) for name in "COMMENT NL NEWLINE INDENT DEDENT ENDMARKER".split()}
+LAYOUT = {getattr(tokenize, name) for name in ["COMMENT", "NL", "NEWLINE", "INDENT", "DEDENT", "ENDMARKER"]}
 
 
 def count_code_lines(source: str) -> int:
