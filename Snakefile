@@ -33,7 +33,7 @@ RUNS = chapters.all_runs(config)
 PARAMETERS = {run: chapters.run_parameters(config, run) for run in RUNS}  # a name that a notebook lacks ends here
 DIGESTS = {chapter: chapters.chapter_digest(NOTEBOOKS / f"{chapter}.ipynb") for chapter in chapters.CHAPTERS}
 TRANSLATION = chapters.translation(config)  # network and options of the generated images, those of chapter 05
-RECIPES = (config["virtual"] or {}).get("sessions", {})
+RECIPES = (config["simulated"] or {}).get("sessions", {})
 PYTHON, JUPYTER_BOOK = sys.executable, Path(sys.executable).with_name("jupyter-book")
 
 # One job uses the threads it was given and no more, and threads that wait leave the processor to others.
@@ -53,7 +53,7 @@ wildcard_constraints:
 
 
 def session_made(session):
-    """Name the file that says a session is there; a virtual one is made by its rule, a real one must be on disk."""
+    """Name the file that says a session is there; a simulated one is made by its rule, a real one must be on disk."""
     if session in RECIPES:
         return f"{SESSIONS_ROOT}/{session}/session.json"
     stamps = f"{SESSIONS_ROOT}/{session}/radar.timestamps"
@@ -63,8 +63,8 @@ def session_made(session):
 
 
 def recipe(session):
-    """Give what a virtual session depends on: the settings common to all and its own."""
-    return {**config["virtual"], "sessions": {session: RECIPES[session]}}
+    """Give what a simulated session depends on: the settings common to all and its own."""
+    return {**config["simulated"], "sessions": {session: RECIPES[session]}}
 
 
 def executed(chapter, folder=f"{OUT}/notebooks"):
@@ -205,7 +205,7 @@ rule chapters:
         [run.path(OUT) for run in RUNS],
 
 
-rule virtual_session:
+rule simulated_session:
     output:
         SESSIONS_ROOT + "/{session}/session.json",
     log:
@@ -215,7 +215,7 @@ rule virtual_session:
         code=chapters.simulator_digest(),
         made=SESSIONS_ROOT + "/{session}",
     message:
-        "virtual session {wildcards.session}"
+        "simulated session {wildcards.session}"
     shell:  # the writer goes on with what is there, which is right after a stop and wrong after a change of its code
         'made={params.made:q}; [ "$(cat "$made.code" 2>/dev/null)" = {params.code} ] '
         """|| ! grep -qs '"format":' "$made/settings.json" || rm -rf "$made"; """

@@ -53,7 +53,7 @@ CONFIG_KEYS = {
     "book_dir",
     "seed",
     "notebooks",
-    "virtual",
+    "simulated",
 }
 OPTIONAL_KEYS = {"real_root"}
 

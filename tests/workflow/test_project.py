@@ -76,8 +76,8 @@ def test_profile_is_whole_and_its_knobs_are_parameters(profile: Path) -> None:
     assert config["profile"] == profile.stem
     for run in chapters.all_runs(config):
         chapters.run_parameters(config, run)
-    made = set((config["virtual"] or {}).get("sessions", {}))
-    assert made == {session for session in config["sessions"] if session.startswith("virtual-")}
+    made = set((config["simulated"] or {}).get("sessions", {}))
+    assert made == {session for session in config["sessions"] if session.startswith("sim-")}
 
 
 @pytest.mark.parametrize("chapter", CHAPTERS)
@@ -404,7 +404,7 @@ def test_network_of_chapter_04_is_trained_before_its_images_are_generated(
     config = chapters.load_config(ROOT / "config/smoke.yaml") | {"out_dir": out_dir}
     config["notebooks"]["05_real_vs_fake"] |= {"network": "chapter 04"}
     (workplace / "own.yaml").write_text(yaml.safe_dump(config), encoding="utf-8")
-    made = "build/smoke/fake/virtual-town-seq01/fake.json"
+    made = "build/smoke/fake/sim-town-seq01/fake.json"
     answer = snakemake(workplace, "-n", "--quiet", "rules", "--configfile", "own.yaml", "--", made)
     assert answer.returncode == 0, answer.stderr
     plan = dict(re.findall(r"^(\w+) +(\d+)$", answer.stdout + answer.stderr, flags=re.MULTILINE))
@@ -416,7 +416,7 @@ def test_smoke_profile_plans_every_run(workplace: Path) -> None:
     assert answer.returncode == 0, answer.stderr
     plan = dict(re.findall(r"^(\w+) +(\d+)$", answer.stdout + answer.stderr, flags=re.MULTILINE))
     assert plan == {
-        "virtual_session": "5",
+        "simulated_session": "5",
         "alignment": "5",
         "ground_removal": "5",
         "generated_images": "5",
