@@ -82,11 +82,11 @@ class MclSettings:
     d_th_m: float = 0.5
     noise_forward_m: float = 0.5
     noise_side_m: float = 0.3
-    noise_yaw_rad: float = np.deg2rad(1.0)
+    noise_yaw_rad: float = float(np.deg2rad(1.0))
     noise_per_m: float = 0.03
     noise_yaw_per_rad: float = 0.03
     start_spread_m: float = 0.5
-    start_spread_yaw_rad: float = np.deg2rad(1.0)
+    start_spread_yaw_rad: float = float(np.deg2rad(1.0))
     likelihood: str = "count"
     sigma_m: float = 0.2
     crowd_m: float = 0.0

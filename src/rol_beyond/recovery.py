@@ -102,7 +102,7 @@ class RecoverySettings:
     far_pause: int = 20
     max_range_m: float = 40.0
     reach_m: float = 30.0
-    reach_yaw: float = np.deg2rad(30.0)
+    reach_yaw: float = float(np.deg2rad(30.0))
     far_after: int = 120
     far_m: float = 300.0
     n_rivals: int = 20

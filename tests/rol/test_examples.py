@@ -16,18 +16,61 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Iterable
+from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
 import yaml
 from packaging.requirements import Requirement
 
-import toolbox_pages
-
 ROOT = Path(__file__).resolve().parents[2]
 PACKAGE = ROOT / "src" / "rol"
 TAKE, OWN_RADAR = ROOT / "book" / "take.md", ROOT / "book" / "own_radar.md"
-EXAMPLES = toolbox_pages.read_examples(TAKE)
+
+
+@dataclass(frozen=True)
+class Example:
+    """A file of the package as the page on taking presents it.
+
+    Attributes
+    ----------
+    needs : str
+        The line that names packages and the files beside it.
+    code, printed : str
+        The example, and what it prints.
+    """
+
+    needs: str
+    code: str
+    printed: str
+
+    @property
+    def packages(self) -> set[str]:
+        """Packages that the example needs."""
+        return set(self.needs.removeprefix("Packages: ").partition(". Beside")[0].split(", "))
+
+    @property
+    def files(self) -> list[str]:
+        """Files that the example needs beside it."""
+        beside = self.needs.partition("Beside it: ")[2]
+        return re.findall(r"`(\w+\.py)`", beside.partition(". ")[0])
+
+
+def read_examples(page: Path) -> dict[str, Example]:
+    """Read the examples of a page: headings that link to a file's page, a line of needs, code, and what it prints."""
+    parts = re.split(r"^### \[(\w+)\]\(.*\)\n", page.read_text(encoding="utf-8"), flags=re.MULTILINE)[1:]
+    found = {}
+    for name, text in zip(parts[::2], parts[1::2], strict=True):
+        needs = re.search(r"^Packages: .*$", text, re.MULTILINE)
+        code = re.search(r"^```python\n(.*?)^```$", text, re.MULTILINE | re.DOTALL)
+        printed = re.search(r"^```text\n(.*?)^```$", text, re.MULTILINE | re.DOTALL)
+        if not (needs and code and printed):
+            raise ValueError(f"{page}: {name}: its packages, its example or what that prints is missing")
+        found[name] = Example(needs[0], code[1], printed[1])
+    return found
+
+
+EXAMPLES = read_examples(TAKE)
 # What the modules import, by the name that pip knows it by.
 PACKAGES = {
     "numpy": "numpy", "scipy": "scipy", "numba": "numba", "pandas": "pandas", "torch": "torch",
