@@ -9,9 +9,13 @@ from __future__ import annotations
 
 from itertools import pairwise
 
+import cv2
 import numpy as np
+from scipy.spatial import cKDTree
 
-from rol.geometry import relative_pose
+from rol.geometry import relative_pose, transform_points
+from rol.radar import MEASURED_RANGE_OFFSET, k_strongest_peaks, polar_to_cartesian
+from rol_sim.sensors.radar import beam_azimuths
 
 BRIGHTNESS_CODES = (40, 60, 80, 100, 120)
 ZERO_RANGES_M = (3.0, 28.0, 41.0, 80.0, 106.0, 145.0)
@@ -292,11 +296,6 @@ def _mean_correlation(
     codes: np.ndarray, ways: np.ndarray, lag: int, twists: np.ndarray | None, doppler_seconds: float
 ) -> float:
     """Mean correlation of scans i and i + lag, as images of 0.25 m per pixel laid on each other."""
-    import cv2
-
-    from rol.radar import MEASURED_RANGE_OFFSET, polar_to_cartesian
-    from rol_sim.sensors.radar import beam_azimuths
-
     azimuths = beam_azimuths()
     width, pixel, found = 512, 0.25, []
     middle = (width - 1) / 2.0
@@ -419,12 +418,6 @@ def map_shares(
     shares : array, shape (n, len(within_m))
         Share of the peaks of each scan; NaN for a scan without peaks.
     """
-    from scipy.spatial import cKDTree
-
-    from rol.geometry import transform_points
-    from rol.radar import MEASURED_RANGE_OFFSET, k_strongest_peaks
-    from rol_sim.sensors.radar import beam_azimuths
-
     tree, shares = cKDTree(map_points), []
     for scan, pose in zip(codes, poses, strict=True):
         peaks = k_strongest_peaks(

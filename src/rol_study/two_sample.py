@@ -11,6 +11,9 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
+from scipy.stats import rankdata
+
+from rol_study.radar_statistics import MEASURED_RANGE_RESOLUTION
 
 ROWS, BINS = 16, 64  # size of a patch
 
@@ -65,8 +68,6 @@ def area_under_curve(real: np.ndarray, simulated: np.ndarray) -> float:
     auc : float
         Between 0 and 1; 0.5 if the scores tell nothing.
     """
-    from scipy.stats import rankdata
-
     real, simulated = np.ravel(real), np.ravel(simulated)
     ranks = rankdata(np.concatenate([real, simulated]))[: len(real)]
     return float((ranks.sum() - 0.5 * len(real) * (len(real) + 1)) / (len(real) * len(simulated)))
@@ -136,8 +137,6 @@ def give_aways(verdict: Verdict, real: np.ndarray, simulated: np.ndarray) -> dic
         "range": area under the curve of patches by range "low-high" [m]; "brightest": by the brightest code
         in the patch. 0.5 where it cannot tell.
     """
-    from rol_study.radar_statistics import MEASURED_RANGE_RESOLUTION
-
     peaks = np.stack([cut_patches(real), cut_patches(simulated)]).max(axis=(-1, -2))
     range_m = np.broadcast_to(
         (np.arange(peaks.shape[3]) + 0.5) * BINS * MEASURED_RANGE_RESOLUTION, peaks.shape

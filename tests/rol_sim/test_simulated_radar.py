@@ -8,7 +8,8 @@ pytest.importorskip("open3d")
 from rol_sim.sensors import radar_signal
 from rol_sim.sensors.radar import RadarSettings, beam_azimuths, simulate_scan
 from rol_sim.sensors.radar_surfaces import Surface, surface_table
-from rol_sim.world.scene import Material, Scene, make_mesh, merge_meshes
+from rol_sim.world.mesh import Material, make_mesh, merge_meshes
+from rol_sim.world.scene import Scene
 from rol_study import radar_statistics as statistics
 
 pytestmark = pytest.mark.open3d

@@ -12,15 +12,13 @@ row 0 looks 0.836 deg to the right of forward.
 from __future__ import annotations
 
 from dataclasses import dataclass, field, fields
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from rol.geometry import check_fields, check_poses
-
-if TYPE_CHECKING:
-    from rol_sim.sensors.radar_surfaces import Surface
-    from rol_sim.world.scene import Scene
+from rol_sim.sensors.radar_signal import echoes_to_codes, range_to_bins
+from rol_sim.sensors.radar_surfaces import Surface, scatter, surface_table
+from rol_sim.world.scene import Scene
 
 N_AZIMUTHS, N_COUNTS, FIRST_COUNT, COUNT_STEP = 400, 5600, 13, 14
 ROW_ANGLE = 2.0 * np.pi * COUNT_STEP / N_COUNTS
@@ -175,8 +173,6 @@ def simulate_scan(
     ValueError
         If poses or velocities do not have 400 rows of finite numbers.
     """
-    from rol_sim.sensors.radar_signal import echoes_to_codes, range_to_bins
-
     settings = settings or RadarSettings()
     row_poses, velocities = check_poses(row_poses, "row_poses"), np.asarray(row_velocities, dtype=np.float64)
     if row_poses.shape != (N_AZIMUTHS, 3):
@@ -258,8 +254,6 @@ def trace_echoes(scene: Scene, rays: Rays, settings: RadarSettings) -> tuple[np.
     objects : array, shape (n,)
         Object number.
     """
-    from rol_sim.sensors.radar_surfaces import scatter, surface_table
-
     table, found = surface_table(settings.surfaces), []
     spacing, haze = ROW_ANGLE / settings.rays_per_row, 10.0 ** (settings.haze_db / 10.0)
     for _ in range(settings.veil_layers + settings.bounces):

@@ -12,6 +12,7 @@ import numpy as np
 
 from rol.compiled import compiled
 from rol.geometry import check_fields
+from rol_sim.world.mesh import Material
 
 CELL = 0.5  # grain of the world along a surface [m]: what a brick pier, a drain pipe, a window frame take up
 MOST_CELLS = 12  # cells that may answer between two neighbouring rays
@@ -97,8 +98,6 @@ def surface_table(changed: dict[str, Surface]) -> np.ndarray:
     table : array, shape (256, 8), float32
         The fields of `Surface` in order; the lobe in [rad].
     """
-    from rol_sim.world.mesh import Material
-
     table = np.zeros((256, 8), dtype=np.float32)
     for material in Material:
         s = {**SURFACES, **changed}.get(material.name, OTHER_SURFACE)
