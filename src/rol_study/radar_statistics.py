@@ -39,7 +39,9 @@ def forbidden_codes() -> np.ndarray:
     return np.setdiff1d(np.arange(24), reachable).astype(np.uint8)
 
 
-def brightness_shares(codes: np.ndarray, codes_from: tuple[int, ...] = BRIGHTNESS_CODES) -> dict[int, float]:
+def brightness_fractions(
+    codes: np.ndarray, codes_from: tuple[int, ...] = BRIGHTNESS_CODES
+) -> dict[int, float]:
     """Give the share of pixels at or above each code.
 
     Parameters
@@ -92,7 +94,9 @@ def hellinger_distance(p: np.ndarray, q: np.ndarray) -> float:
     return float(np.sqrt(max(0.0, 1.0 - np.sum(np.sqrt(np.asarray(p) * np.asarray(q))))))
 
 
-def zero_shares(codes: np.ndarray, ranges_m: tuple[float, ...] = ZERO_RANGES_M, half_bins: int = 15) -> dict:
+def zero_fractions(
+    codes: np.ndarray, ranges_m: tuple[float, ...] = ZERO_RANGES_M, half_bins: int = 15
+) -> dict:
     """Give the share of code 0 in quiet bins at several ranges.
 
     Parameters
@@ -331,11 +335,11 @@ def scan_statistics(codes: np.ndarray) -> dict:
     Returns
     -------
     statistics : dict
-        "histogram": share of every code; "shares": code -> share of pixels at or above it; "zero_shares": range [m] -> share of code 0 in quiet
+        "histogram": share of every code; "shares": code -> share of pixels at or above it; "zero_fractions": range [m] -> share of code 0 in quiet
         bins; "range_correlation": of the noise at lags 1-7 bins; "azimuth_correlation"; "near_field": range
         [m] -> mean code; "near_copies": True when bins 0-4 are identical; "floors": class of peak -> far
         floor; "point_spread": levels [dB] by distance; "forbidden": number of pixels with a code that cannot
-        be; "greatest": greatest code; "shares_40_by_range": share of codes >= 40 by range, edges [m] as keys.
+        be; "greatest": greatest code; "fractions_40_by_range": share of codes >= 40 by range, edges [m] as keys.
 
     Raises
     ------
@@ -348,9 +352,9 @@ def scan_statistics(codes: np.ndarray) -> dict:
     near = _rows(codes)[:, :5]
     return {
         "histogram": code_histogram(codes),
-        "shares": brightness_shares(codes),
-        "shares_40_by_range": shares_by_range(codes, 40),
-        "zero_shares": zero_shares(codes),
+        "shares": brightness_fractions(codes),
+        "fractions_40_by_range": fractions_by_range(codes, 40),
+        "zero_fractions": zero_fractions(codes),
         "range_correlation": noise_correlation(codes),
         "azimuth_correlation": azimuth_correlation(codes),
         "near_field": near_field(codes),
@@ -362,7 +366,7 @@ def scan_statistics(codes: np.ndarray) -> dict:
     }
 
 
-def shares_by_range(
+def fractions_by_range(
     codes: np.ndarray, code: int, edges_m: tuple[float, ...] = (2.5, 5, 10, 20, 30, 50, 80, 110, 165)
 ) -> dict:
     """Give the share of pixels at or above a code, ring by ring.
@@ -387,7 +391,7 @@ def shares_by_range(
     return dict(zip(names, shares, strict=True))
 
 
-def map_shares(
+def map_fractions(
     codes: np.ndarray,
     poses: np.ndarray,
     map_points: np.ndarray,

@@ -19,13 +19,13 @@ from rol.pairs import estimate_twists
 from rol.pix2pix import TrainedNetwork
 from rol_beyond.front_ends import translate_scan
 from rol_data import rall
-from rol_sim.session.assembly import SimulatedSession, build_session, make_scan
 from rol_sim.session.settings import parse_settings
+from rol_sim.session.simulation import SimulatedSession, build_session, make_scan
 
 STREET = {"parked_share": 0.15, "vehicles": 10, "people": 6}  # as for the twins of the real scans
 
 
-def render_clouds(
+def render_points(
     real_root: Path | str,
     number: str,
     first_scan: int,
@@ -84,14 +84,14 @@ def render_clouds(
     The network `rol` learnt on this route, in such a world of seed 21: from scans 0 to 4999 of session 02 but for the
     surroundings of the eleven real scans and of one more place (``sets`` in its card). Clouds from there flatter it.
     """
-    session = build_stretch(real_root, number, first_scan, n_scans, seed, **changes)
+    session = build_segment(real_root, number, first_scan, n_scans, seed, **changes)
     return _translate(session, network, bf16=bf16, headings=headings)
 
 
-def build_stretch(
+def build_segment(
     real_root: Path | str, number: str, first_scan: int, n_scans: int, seed: int, **changes: Any
 ) -> SimulatedSession:
-    """Prepare the drive along a stretch of a real session, see `render_clouds`.
+    """Prepare the drive along a stretch of a real session, see `render_points`.
 
     Returns
     -------

@@ -8,7 +8,7 @@ pytest.importorskip("open3d")
 from rol.geometry import compose
 from rol.oxford import EXTRINSICS, VelodyneRaw, velodyne_raw_to_points
 from rol_sim.drive import traffic
-from rol_sim.drive.planned import Route, build_route, plan_drive
+from rol_sim.drive.town_loop import Route, build_route, plan_trajectory
 from rol_sim.sensors import lidar as lidar_sensor
 from rol_sim.sensors.lidar import LidarSettings, schedule_firings, simulate_sweep
 from rol_sim.world import town as world
@@ -30,7 +30,7 @@ def town() -> world.Town:
 
 @pytest.fixture(scope="module")
 def drive(town: world.Town):
-    return plan_drive(build_route(town.plan), STAMP, 40.0, np.random.default_rng(5))
+    return plan_trajectory(build_route(town.plan), STAMP, 40.0, np.random.default_rng(5))
 
 
 def wall(x: float, material: int, number: int):
@@ -227,7 +227,7 @@ def test_no_direction_is_empty(town: world.Town) -> None:
 
 
 def test_sessions_dress_the_town_differently(town: world.Town) -> None:
-    first, other = (world.dress(town, np.random.default_rng(k)) for k in (1, 2))
+    first, other = (world.add_session_objects(town, np.random.default_rng(k)) for k in (1, 2))
     assert len(first.triangles) != len(other.triangles)
     assert first.objects.min() == town.mesh.objects.max() + 1
     found = {Material(number) for number in np.unique(first.materials)}
@@ -238,7 +238,7 @@ def test_sessions_dress_the_town_differently(town: world.Town) -> None:
         Material.TREE_TRUNK,
         Material.METAL,
     }
-    bare = world.dress(town, np.random.default_rng(1), parked_share=0.0, leaf_density=0.5)
+    bare = world.add_session_objects(town, np.random.default_rng(1), parked_share=0.0, leaf_density=0.5)
     assert not (bare.materials == Material.VEHICLE).any()
     ratio = (bare.materials == Material.TREE_CROWN).sum() / (first.materials == Material.TREE_CROWN).sum()
     assert 0.45 < ratio < 0.55
@@ -283,7 +283,7 @@ def test_drive_obeys_physics(town: world.Town, drive) -> None:
 def test_drive_stops_on_the_way(town: world.Town) -> None:
     route = build_route(town.plan)
     for stops in (0, 1, 2):
-        d = plan_drive(route, STAMP, 60.0, np.random.default_rng(2), n_stops=stops, stand_s=1.0)
+        d = plan_trajectory(route, STAMP, 60.0, np.random.default_rng(2), n_stops=stops, stand_s=1.0)
         is_standing = d.speeds < 0.02
         begins = np.flatnonzero(is_standing[1:] & ~is_standing[:-1])
         assert len(begins) == stops
@@ -292,7 +292,8 @@ def test_drive_stops_on_the_way(town: world.Town) -> None:
 def test_sessions_start_a_few_metres_apart(town: world.Town) -> None:
     route = build_route(town.plan)
     starts = [
-        plan_drive(route, STAMP, 5.0, np.random.default_rng(k), start_m=20.0).progress[0] for k in range(12)
+        plan_trajectory(route, STAMP, 5.0, np.random.default_rng(k), start_m=20.0).progress[0]
+        for k in range(12)
     ]
     offsets = np.abs(np.array(starts) - 20.0)
     assert offsets.min() >= 1.0 and offsets.max() <= 4.0
@@ -307,7 +308,7 @@ def test_drive_interpolates_and_refuses_times_outside(drive) -> None:
         drive.pose(np.array([drive.stamps_us[-1] + 1]))
     route = Route(np.zeros((4, 2)), 1.0, np.zeros(0))
     with pytest.raises(ValueError, match="must be positive"):
-        plan_drive(route, STAMP, -1.0, np.random.default_rng(0))
+        plan_trajectory(route, STAMP, -1.0, np.random.default_rng(0))
 
 
 def test_nobody_drives_through_the_car(town: world.Town, drive) -> None:

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from rol.geometry import wrap_angle
-from rol_sim.drive.planned import Drive, Route
+from rol_sim.drive.town_loop import Drive, Route
 from rol_sim.world.mesh import Mesh, merge_meshes, move_mesh
 from rol_sim.world.streets import StreetPlan
 from rol_sim.world.vehicles import MOVING_KINDS, build_cyclist, build_pedestrian, build_vehicle, draw_kind

@@ -10,7 +10,7 @@ import pandas as pd
 from scipy.signal import lfilter
 
 from rol.geometry import relative_pose
-from rol_sim.drive.planned import Drive
+from rol_sim.drive.town_loop import Drive
 
 N_ROWS = 400
 SWEEP_US = 50_000

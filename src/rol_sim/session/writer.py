@@ -26,7 +26,8 @@ from rol.evaluation import write_tum
 from rol.files import is_used, read_marker, write_bytes, write_text
 from rol.oxford import VelodyneRaw, save_radar, save_velodyne_raw
 from rol_sim.session import logs
-from rol_sim.session.assembly import (
+from rol_sim.session.settings import SimulationSettings, describe
+from rol_sim.session.simulation import (
     GPS,
     INS,
     ODOMETRY,
@@ -36,7 +37,6 @@ from rol_sim.session.assembly import (
     make_sweep,
     sensor_settings,
 )
-from rol_sim.session.settings import SimulationSettings, describe
 
 SCAN_BYTES, SWEEP_BYTES = 470_000, 65_000  # what a file takes on the mean
 FORMAT = 4  # raise it when the same settings give other files
@@ -96,7 +96,7 @@ def write_session(
     if not _prepare_folder(folder, {"format": FORMAT, **describe(settings, name)}, report):
         return folder
     session = build_session(settings, name)
-    report(f"{name}: {check_room(folder, session)}")
+    report(f"{name}: {check_disk_space(folder, session)}")
     n = len(session.scans_us)
     edges = np.unique(np.linspace(0, n, min(n, max(20, n // 50)) + 1).astype(int)).tolist()
     begin = perf_counter()
@@ -109,7 +109,7 @@ def write_session(
     return folder
 
 
-def check_room(folder: Path, session: SimulatedSession) -> str:
+def check_disk_space(folder: Path, session: SimulatedSession) -> str:
     """Say how much will be written, and refuse if the disk has not the room.
 
     Parameters

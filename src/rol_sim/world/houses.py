@@ -17,7 +17,7 @@ from rol_sim.world.streets import Street, StreetPlan
 
 @dataclass
 class Builder:
-    """Collects what has been built: meshes, footprints, and the plants and driveways that sessions dress.
+    """Collects what has been built: meshes, footprints, and the plants and driveways that sessions add.
 
     Attributes
     ----------
@@ -227,15 +227,15 @@ def build_landmarks(builder: Builder, rng: np.random.Generator) -> np.ndarray:
     green : array, shape (5,)
         Footprint of the green.
     """
-    church = find_room(builder, 13.0, 6.0, 6.0, 14.0, rng)
+    church = find_free_plot(builder, 13.0, 6.0, 6.0, 14.0, rng)
     if church is not None:
         builder.add(build_block(-13.0, 6.0, -6.0, 6.0, 9.0, 5.0, windows=4.0), church[:3], sink=0.2)
         builder.add(build_block(6.0, 13.0, -3.5, 3.5, 21.0, 0.0, windows=3.5), church[:3], sink=0.2)
     for a, b, height in ((16.0, 9.0, 7.0), (12.0, 10.0, 12.0)):
-        hall = find_room(builder, a, b, 4.0, 12.0, rng)
+        hall = find_free_plot(builder, a, b, 4.0, 12.0, rng)
         if hall is not None:
             builder.add(build_block(-a, a, -b, b, height, 0.0, windows=3.5), hall[:3], sink=0.2)
-    green = find_room(builder, 17.0, 12.0, 2.2, 4.5, rng)
+    green = find_free_plot(builder, 17.0, 12.0, 2.2, 4.5, rng)
     return np.zeros(5) if green is None else green
 
 
@@ -243,13 +243,13 @@ def build_sheds(builder: Builder, count: int, rng: np.random.Generator) -> None:
     """Fill back yards and the outskirts with sheds, garages and houses off the street; fills the builder."""
     for _ in range(count):
         a, b = float(rng.uniform(1.5, 6.0)), float(rng.uniform(1.5, 4.0))
-        place = find_room(builder, a, b, 9.0, 60.0, rng, tries=6)
+        place = find_free_plot(builder, a, b, 9.0, 60.0, rng, tries=6)
         if place is not None:
             height = float(rng.uniform(2.2, 3.2) if a * b < 12.0 else rng.uniform(4.0, 8.0))
             builder.add(build_block(-a, a, -b, b, height, float(rng.uniform(0.0, 2.0))), place[:3], sink=0.2)
 
 
-def find_room(
+def find_free_plot(
     builder: Builder,
     a: float,
     b: float,

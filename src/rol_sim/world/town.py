@@ -1,6 +1,6 @@
 """The town: streets, houses, gardens and the land, drawn once; and what differs from one session to the next.
 
-`build_town` draws what stays. `dress` adds what a session finds: parked vehicles, the leaves of its season,
+`build_town` draws what stays. `add_session_objects` adds what a session finds: parked vehicles, the leaves of its season,
 cut hedges, changed street furniture. Both are determined by the generator they are given.
 """
 
@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from rol.geometry import transform_points
-from rol_sim.world.houses import Builder, build_landmarks, build_sheds, build_street_side, find_room
+from rol_sim.world.houses import Builder, build_landmarks, build_sheds, build_street_side, find_free_plot
 from rol_sim.world.mesh import Material, Mesh, make_mesh, merge_meshes, move_mesh
 from rol_sim.world.shapes import build_hedge, build_quads, build_tree
 from rol_sim.world.streets import Street, StreetPlan, build_plan
@@ -83,7 +83,7 @@ def build_town(rng: np.random.Generator, *, loop_length: float = 600.0, relief: 
     return Town(plan, mesh, trees, hedges, slots, tuple(furniture), builder.footprints)
 
 
-def dress(
+def add_session_objects(
     town: Town,
     rng: np.random.Generator,
     *,
@@ -172,7 +172,7 @@ def _plant_trees(builder: Builder, green: np.ndarray, rng: np.random.Generator) 
                 places.append(at[_far_from_junctions(plan, at, 10.0) & (plan.clearance(at) > 0.4)])
     street_trees = np.concatenate([np.zeros((0, 2)), *places])
     in_green = rng.uniform(-1.0, 1.0, (14, 2)) * green[3:]
-    garden = [find_room(builder, 1.2, 1.2, 2.8, 30.0, rng, tries=4) for _ in range(170)]
+    garden = [find_free_plot(builder, 1.2, 1.2, 2.8, 30.0, rng, tries=4) for _ in range(170)]
     garden_trees = np.array([g[:2] for g in garden if g is not None]).reshape(-1, 2)
     if green[3] > 0:
         garden_trees = np.concatenate([garden_trees, transform_points(green[:3], in_green)])

@@ -157,7 +157,7 @@ def build_route(plan: StreetPlan, *, rounding: float = 5.5, spacing: float = 0.2
     return Route(points, gap, np.sort(np.array(nearest) * gap))
 
 
-def plan_drive(
+def plan_trajectory(
     route: Route,
     first_stamp_us: int,
     duration_s: float,

@@ -2,7 +2,7 @@
 
 A small convolutional network looks at patches of 16 azimuths x 64 range bins and says "real" or "simulated". It
 learns on some scans and is judged on others. An area under the curve of 0.5 means that it cannot tell, 1 that
-it always can. `give_aways` says where it can.
+it always can. `auc_by_group` says where it can.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ ROWS, BINS = 16, 64  # size of a patch
 
 
 @dataclass(frozen=True)
-class Verdict:
+class ClassifierResult:
     """What a classifier found on scans that it had not learnt from.
 
     Attributes
@@ -73,7 +73,7 @@ def area_under_curve(real: np.ndarray, simulated: np.ndarray) -> float:
     return float((ranks.sum() - 0.5 * len(real) * (len(real) + 1)) / (len(real) * len(simulated)))
 
 
-def tell_apart(
+def train_classifier(
     real: np.ndarray,
     simulated: np.ndarray,
     rng: np.random.Generator,
@@ -81,7 +81,7 @@ def tell_apart(
     folds: int = 3,
     epochs: int = 4,
     bf16: bool = False,
-) -> Verdict:
+) -> ClassifierResult:
     """Train classifiers on some scans and judge them on the others.
 
     Parameters
@@ -100,7 +100,7 @@ def tell_apart(
 
     Returns
     -------
-    verdict : Verdict
+    verdict : ClassifierResult
 
     Raises
     ------
@@ -118,16 +118,18 @@ def tell_apart(
         classifier = _train(patches[:, learnt], rng, epochs, bf16)
         scores[:, left_out] = _score(classifier, patches[:, left_out], bf16)
         aucs.append(area_under_curve(*scores[:, left_out]))
-    return Verdict(area_under_curve(*scores), np.array(aucs), scores)
+    return ClassifierResult(area_under_curve(*scores), np.array(aucs), scores)
 
 
-def give_aways(verdict: Verdict, real: np.ndarray, simulated: np.ndarray) -> dict[str, dict[str, float]]:
+def auc_by_group(
+    verdict: ClassifierResult, real: np.ndarray, simulated: np.ndarray
+) -> dict[str, dict[str, float]]:
     """Say by what patches the classifier tells the two apart.
 
     Parameters
     ----------
-    verdict : Verdict
-        From `tell_apart`.
+    verdict : ClassifierResult
+        From `train_classifier`.
     real, simulated : array, shape (n, 400, 3768), uint8
         The scans that it was made from.
 

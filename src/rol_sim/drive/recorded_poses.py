@@ -10,7 +10,7 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.spatial import cKDTree
 
-from rol_sim.drive.planned import POSE_STEP_US, Drive
+from rol_sim.drive.town_loop import POSE_STEP_US, Drive
 from rol_sim.drive.traffic import TRACK_STEP_US, Traffic
 from rol_sim.world.mesh import Mesh, merge_meshes, move_mesh
 from rol_sim.world.vehicles import (
@@ -29,7 +29,7 @@ SLOT_M = 6.3
 CATALOGUE = 24  # so many different vehicles drive about
 
 
-def interpolate_drive(stamps_us: np.ndarray, poses: np.ndarray) -> Drive:
+def interpolate_trajectory(stamps_us: np.ndarray, poses: np.ndarray) -> Drive:
     """Drive smoothly through given poses.
 
     Parameters

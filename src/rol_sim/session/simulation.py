@@ -18,8 +18,8 @@ import numpy as np
 from rol.maps import thin_points
 from rol.oxford import EXTRINSICS, RANGE_UNIT, RadarScan, load_velodyne_raw, velodyne_raw_to_points
 from rol_data import rall
-from rol_sim.drive.planned import Drive, build_route, plan_drive
-from rol_sim.drive.recorded import interpolate_drive, park_vehicles, plan_encounters
+from rol_sim.drive.recorded_poses import interpolate_trajectory, park_vehicles, plan_encounters
+from rol_sim.drive.town_loop import Drive, build_route, plan_trajectory
 from rol_sim.drive.traffic import Traffic, plan_traffic
 from rol_sim.sensors.lidar import LidarSettings, Sweep, schedule_firings, simulate_sweep
 from rol_sim.sensors.radar import RadarSettings, simulate_scan
@@ -29,7 +29,7 @@ from rol_sim.world import mapped
 from rol_sim.world.mapped import Cells, classify_cells, draw_unmapped
 from rol_sim.world.mesh import Mesh, merge_meshes
 from rol_sim.world.scene import Scene
-from rol_sim.world.town import Town, build_town, dress
+from rol_sim.world.town import Town, add_session_objects, build_town
 
 LIDARS = ("velodyne_left", "velodyne_right")
 FIRST_COUNT, COUNT_STEP = 13, 14  # encoder counts of the radar's rows: 13, 27, ... 5599 of 5600
@@ -37,7 +37,7 @@ WORLD_RADIUS_M = 180.0  # how far from the drive a world grown from a map reache
 CAR_M = 1.8  # so near to where the car drives stands nothing, whatever the map says
 CLEAR_M = 3.0  # what the map does not show stays so far from there
 # Parts of a session that draw from generators of their own.
-DRESS, DRIVE, TRAFFIC, SCANS, SWEEPS, ODOMETRY, GPS, INS, SCAN, SWEEP = range(10)
+OBJECTS, DRIVE, TRAFFIC, SCANS, SWEEPS, ODOMETRY, GPS, INS, SCAN, SWEEP = range(10)
 
 
 @dataclass(frozen=True)
@@ -180,13 +180,13 @@ def _find_town(
 ) -> tuple[Town, Callable[[np.ndarray], np.ndarray], Mesh, Drive, Traffic]:
     """The town as one session finds it, and who is on the move."""
     town = _build_town(settings.seed, settings.loop_m, settings.relief_m)
-    standing = dress(
-        town, rng(DRESS), parked_share=own.parked_share, leaf_density=own.leaf_density,
+    standing = add_session_objects(
+        town, rng(OBJECTS), parked_share=own.parked_share, leaf_density=own.leaf_density,
         changed_share=own.changed_share,
     )  # fmt: skip
     route = build_route(town.plan)
     duration_s = float(scans[-1] + turns[-1] - scans[0]) * 1e-6
-    drive = plan_drive(
+    drive = plan_trajectory(
         route, int(scans[0]), duration_s, rng(DRIVE),
         start_m=settings.start_m, cruise_mps=own.cruise_mps, n_stops=own.stops, stand_s=own.stand_s,
     )  # fmt: skip
@@ -209,12 +209,12 @@ def _find_route(
     whole, unmapped = _read_map(path, settings.seed, settings.unmapped_share)
     cells = mapped.crop_cells(whole, places, WORLD_RADIUS_M)
     lane = thin_points(poses[:, :2], 0.5)[0]
-    later = mapped.change_cells(cells, rng(DRESS), missing_share=own.changed_share)
+    later = mapped.change_cells(cells, rng(OBJECTS), missing_share=own.changed_share)
     left = mapped.join_cells(
         mapped.crop_cells(later, lane, WORLD_RADIUS_M, clear_m=CAR_M),  # the map keeps traces of traffic
         mapped.crop_cells(unmapped, lane, WORLD_RADIUS_M, clear_m=CLEAR_M),
     )
-    drive = interpolate_drive(middles_us, poses)
+    drive = interpolate_trajectory(middles_us, poses)
     things = [
         mapped.build_ground(places, WORLD_RADIUS_M),
         mapped.build_pieces(left, settings.seed, leaf_density=own.leaf_density),
