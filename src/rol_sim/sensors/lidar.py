@@ -9,14 +9,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from rol.geometry import check_fields
-
-if TYPE_CHECKING:
-    from rol_sim.world.scene import Scene
+from rol_sim.world.mesh import Material
+from rol_sim.world.scene import Scene
 
 ELEVATIONS_DOWN = np.array([
     -0.1862, -0.1628, -0.1396, -0.1164, -0.0930, -0.0698, -0.0466, -0.0232, 0.0, 0.0232, 0.0466, 0.0698,
@@ -107,8 +105,6 @@ class Sweep:
 @lru_cache
 def surface_table() -> np.ndarray:
     """Give the rows of `SURFACES` in the order of `Material`, shape (n_materials, 3)."""
-    from rol_sim.world.mesh import Material
-
     return np.array([SURFACES.get(m.name, (0.0, 1.0, 0.0)) for m in Material], dtype=np.float32)
 
 
