@@ -114,7 +114,7 @@ def _translate(session: VirtualSession, translator: Translator, **how: Any) -> I
 
     for index, twist in enumerate(true_twists(session)):
         scan = make_scan(session, index)
-        yield translate_scan(translator, scan.codes, scan.azimuths, tuple(twist), **how)[0]
+        yield translate_scan(translator, scan.power, scan.azimuths, tuple(twist), **how)[0]
 
 
 def true_twists(session: VirtualSession) -> np.ndarray:

@@ -328,7 +328,7 @@ def make_scan(session: VirtualSession, index: int) -> RadarScan:
     Returns
     -------
     scan : oxford.RadarScan
-        As `oxford.save_radar` takes it.
+        As `rol_sim.session.oxford_files.save_radar` takes it.
     """
     from rol.oxford import RadarScan
     from rol_sim.sensors.radar import simulate_scan
