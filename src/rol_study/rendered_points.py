@@ -110,7 +110,7 @@ def build_segment(
 def _translate(session: SimulatedSession, network: TrainedNetwork, **how: Any) -> Iterator[np.ndarray]:
     for index, twist in enumerate(true_twists(session)):
         scan = make_scan(session, index)
-        yield translate_scan(network, scan.codes, scan.azimuths, tuple(twist), **how)[0]
+        yield translate_scan(network, scan.power, scan.azimuths, tuple(twist), **how)[0]
 
 
 def true_twists(session: SimulatedSession) -> np.ndarray:
