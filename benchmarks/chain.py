@@ -5,7 +5,7 @@ python benchmarks/chain.py [--real-root DIR] [--rounds 2] [--threads 2]
 
 Each scan goes through a front end (raw peaks, or a network and the points of its image), the book's odometry, and one
 update of the filter `rol` on the map, as they would come from a car: no scan is known before its turn. The scans are
-the real ones in a row, again and again, for as many rounds; without the real data, the first of a virtual session, and
+the real ones in a row, again and again, for as many rounds; without the real data, the first of a simulated session, and
 random streets for a map. Times are medians over the scans, for each part; the rate is that of the parts' sum. What
 poses come out is no matter here. The paper's network at its full width has random weights, which cost the same; what it
 draws is of no use, so raw peaks are handed on in its place.
@@ -43,18 +43,18 @@ Scan = tuple[np.ndarray, np.ndarray]
 FrontEnd = Callable[[np.ndarray, np.ndarray], np.ndarray]
 
 
-def open_scans(given: str, n_virtual: int = 11) -> tuple[list[Scan], str]:
+def open_scans(given: str, n_simulated: int = 11) -> tuple[list[Scan], str]:
     """Codes and bearings of the scans, and what they are."""
     root = rall.find_real_root(given)
     if root is not None:
         scans = rall.load_scans(root)
         return [(scan.codes, scan.azimuths) for scan in scans], f"{len(scans)} real scans"
-    folder = ROOT / "data" / "sessions" / "demo" / "virtual-town-seq01"
+    folder = ROOT / "data" / "sessions" / "demo" / "sim-town-seq01"
     if not folder.is_dir():
         raise SystemExit(f"{folder}: missing, and no real data at hand; `make book` makes the session")
-    stamps_us = load_timestamps(folder / "radar.timestamps")[:n_virtual]
+    stamps_us = load_timestamps(folder / "radar.timestamps")[:n_simulated]
     loaded = [load_radar(folder / "radar" / f"{us}.png") for us in stamps_us]
-    return [(scan.codes, scan.azimuths) for scan in loaded], f"{len(loaded)} virtual scans"
+    return [(scan.codes, scan.azimuths) for scan in loaded], f"{len(loaded)} simulated scans"
 
 
 def list_front_ends(full_width: int = 64) -> dict[str, FrontEnd]:

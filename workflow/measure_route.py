@@ -172,7 +172,7 @@ def measure_outliers(real_root: str, number: str, share: float, seed: int) -> li
 
 
 def measure_rendered(real_root: str, number: str, first: int, n_scans: int, seed: int) -> list[dict]:
-    """Both methods with the virtual radar through the translator, on a stretch where it never learnt."""
+    """Both methods with the simulated radar through the translator, on a stretch where it never learnt."""
     import torch
 
     from rol.pix2pix import load_network

@@ -63,7 +63,7 @@ def load_recipe(path: Path) -> dict[str, Any]:
 
 
 def make_sessions(recipe: dict[str, Any], names: set[str], jobs: int) -> None:
-    """Write the virtual sessions that are asked for and not there yet."""
+    """Write the simulated sessions that are asked for and not there yet."""
     from rol_sim.session.settings import parse_settings
     from rol_sim.session.writer import write_session
 
@@ -121,7 +121,7 @@ def open_real() -> tuple[list[Any], Any] | None:
 
     root = rall.find_real_root()
     if root is None or not (root / rall.SCANS_PATH).is_dir():
-        say("no real scans at hand: the network is judged on virtual places alone")
+        say("no real scans at hand: the network is judged on simulated places alone")
         return None
     return rall.load_scans(root), cKDTree(rall.load_map_points(root / rall.MAP_PATH))
 
@@ -156,7 +156,7 @@ def judge(
 
 
 def choose_threshold(judged: pd.DataFrame, reach: float | None) -> int:
-    """Choose the highest level at which so large a share of the real points of the virtual places is still reached."""
+    """Choose the highest level at which so large a share of the real points of the simulated places is still reached."""
     if reach is None:
         return 128
     reached = judged[judged.places != "real"].groupby("threshold").real_to_fake_within_1m.mean()

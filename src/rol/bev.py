@@ -10,6 +10,11 @@ from __future__ import annotations
 
 import numpy as np
 
+try:
+    from .geometry import check_points
+except ImportError:  # this file was copied on its own
+    from geometry import check_points
+
 
 def points_to_image(
     points: np.ndarray, *, width: int = 512, pixel_size: float = 0.25, max_range: float = 64.0
@@ -41,13 +46,7 @@ def points_to_image(
     -----
     Yin et al. 2020, Eq. 1.
     """
-    points = np.asarray(points, dtype=np.float64)
-    if points.ndim != 2 or points.shape[1] < 2:
-        raise ValueError(f"points: expected shape (n, 2) or more columns, got {points.shape}")
-    if not np.isfinite(points[:, :2]).all():
-        raise ValueError(
-            f"points: point {int(np.argmin(np.isfinite(points[:, :2]).all(axis=1)))} is not finite"
-        )
+    points = check_points(points, more=True)
     cells = np.floor(width / 2.0 - points[:, :2] / pixel_size)
     cells = cells[((cells >= 0) & (cells < width)).all(axis=1)].astype(np.int64)
     centres = ((width - 1) / 2.0 - cells) * pixel_size

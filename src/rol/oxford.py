@@ -23,10 +23,10 @@ import pandas as pd
 
 try:
     from .files import read_text, write_bytes, write_text
-    from .geometry import accumulate_steps, flip_y_z, interpolate_poses, transform_from_euler
+    from .geometry import accumulate_steps, check_points, transform_from_euler
 except ImportError:  # this file was copied on its own
     from files import read_text, write_bytes, write_text
-    from geometry import accumulate_steps, flip_y_z, interpolate_poses, transform_from_euler
+    from geometry import accumulate_steps, check_points, transform_from_euler
 
 N_AZIMUTHS, N_BINS, N_HEADER = (
     400,
@@ -54,8 +54,10 @@ OXFORD_EXTRINSICS = {
     "velodyne_left": (-0.60072, -0.34077, -0.26837, -0.0053948, -0.041998, -3.1337),
     "velodyne_right": (-0.61153, 0.55676, -0.27023, 0.0027052, -0.041999, -3.1357),
 }
+# Signs of x y z roll pitch yaw: from y right, z down to y left, z up.
+_TURN = np.array([1.0, -1.0, -1.0, 1.0, -1.0, -1.0])
 # T_vehicle_sensor of each sensor, 4 x 4, in our convention.
-EXTRINSICS = {name: flip_y_z(transform_from_euler(*values)) for name, values in OXFORD_EXTRINSICS.items()}
+EXTRINSICS = {name: transform_from_euler(*(_TURN * values)) for name, values in OXFORD_EXTRINSICS.items()}
 
 ODOMETRY_COLUMNS = ["source_timestamp", "destination_timestamp", "x", "y", "z", "roll", "pitch", "yaw"]
 ODOMETRY_COLUMNS += ["source_radar_timestamp", "destination_radar_timestamp"]
@@ -63,7 +65,6 @@ GPS_COLUMNS = ["timestamp", "num_satellites", "latitude", "longitude", "altitude
 GPS_COLUMNS += ["longitude_sigma", "altitude_sigma", "northing", "easting", "down", "utm_zone"]
 INS_COLUMNS = ["timestamp", "ins_status", "latitude", "longitude", "altitude", "northing", "easting", "down"]
 INS_COLUMNS += ["utm_zone", "velocity_north", "velocity_east", "velocity_down", "roll", "pitch", "yaw"]
-_TURN = np.array([1.0, -1.0, -1.0, 1.0, -1.0, -1.0])  # x y z roll pitch yaw: y right, z down to y left, z up
 
 
 class OxfordError(ValueError):
@@ -364,8 +365,7 @@ def velodyne_raw_to_points(raw: VelodyneRaw, min_range_m: float = 1.0) -> tuple[
 
 def _check_points(path: Path | str, points: np.ndarray) -> None:
     """Refuse points that are not finite or whose intensity is not a byte's."""
-    if not np.isfinite(points).all():
-        raise OxfordError(f"{path}: point {int(np.argwhere(~np.isfinite(points))[0, 0])} is not finite")
+    check_points(points, str(path), columns=4, error=OxfordError)
     if points[:, 3].min() < 0 or points[:, 3].max() > 255:
         raise OxfordError(f"{path}: not four rows x, y, z, intensity: the intensities lie outside 0..255")
 
@@ -575,45 +575,6 @@ def save_ins(path: Path | str, table: pd.DataFrame) -> None:
     _save_table(path, table, INS_COLUMNS, stamp_digits=19)
 
 
-def load_extrinsics(path: Path | str) -> np.ndarray:
-    """Read where a sensor sits on the vehicle.
-
-    Parameters
-    ----------
-    path : path
-        Text file of one line, `x y z roll pitch yaw` [m, rad], vehicle frame with y right and z down.
-
-    Returns
-    -------
-    T_vehicle_sensor : array, shape (4, 4)
-        The sensor's place in the vehicle frame in our convention (y left, z up).
-
-    Raises
-    ------
-    OxfordError
-        If the file is missing or is not six finite numbers.
-    """
-    text = _read_text(path)
-    try:
-        values = np.array(text.split(), dtype=np.float64)
-    except ValueError:
-        values = np.empty(0)
-    if values.shape != (6,) or not np.isfinite(values).all():
-        raise OxfordError(f"{path}: expected six numbers 'x y z roll pitch yaw', got {text.strip()!r:.60}")
-    return flip_y_z(transform_from_euler(*values))
-
-
-def save_extrinsics(path: Path | str, T_vehicle_sensor: np.ndarray) -> None:
-    """Write T_vehicle_sensor (4 x 4, our convention) as `load_extrinsics` reads it, to ten decimals."""
-    T = flip_y_z(_cast(path, "T_vehicle_sensor", T_vehicle_sensor, np.float64, (4, 4)))
-    roll, yaw = np.arctan2(T[2, 1], T[2, 2]), np.arctan2(T[1, 0], T[0, 0])
-    pitch = np.arctan2(-T[2, 0], np.hypot(T[2, 1], T[2, 2]))
-    values = np.round([*T[:3, 3], roll, pitch, yaw], 10) + 0.0  # plus zero: no "-0"
-    if not np.isfinite(values).all():
-        raise OxfordError(f"{path}: T_vehicle_sensor: a value is not finite")
-    write_text(path, " ".join(f"{value:.10g}" for value in values) + "\n")
-
-
 # ---- radar odometry ----
 
 
@@ -745,39 +706,6 @@ def compose_odometry(
     return radar_stamps, mid_stamps, accumulate_steps(o.steps, start)
 
 
-def poses_at(
-    odometry: RadarOdometry,
-    stamps_us: np.ndarray,
-    start: np.ndarray | tuple[float, float, float] = (0.0, 0.0, 0.0),
-) -> np.ndarray:
-    """Give the radar's pose at any times within the odometry's span, interpolated between mid-scan times.
-
-    Parameters
-    ----------
-    odometry : RadarOdometry
-        The steps of a session.
-    stamps_us : array, shape (m,)
-        Times asked for [us].
-    start : array-like, shape (3,)
-        Pose of the first scan at its mid-scan time [m, m, rad].
-
-    Returns
-    -------
-    poses : array, shape (m, 3)
-        T_start_radar at these times (x, y, yaw) [m, m, rad].
-
-    Raises
-    ------
-    OxfordError
-        If a time lies before the first or after the last pose, or the steps have a gap.
-    """
-    _, mid_stamps, poses = compose_odometry(odometry, start)
-    try:
-        return interpolate_poses(mid_stamps, poses, np.atleast_1d(stamps_us))
-    except ValueError as error:
-        raise OxfordError(f"{odometry.path}: {error}") from error
-
-
 # ---- a whole session ----
 
 
@@ -846,8 +774,8 @@ def open_session(path: Path | str) -> Session:
     Parameters
     ----------
     path : path
-        Folder that holds `radar/` and `radar.timestamps`; lidars may be missing. A virtual session (its name
-        begins with `virtual-`) must hold the `session.json` that its maker writes last.
+        Folder that holds `radar/` and `radar.timestamps`; lidars may be missing. A simulated session (its name
+        begins with `sim-`) must hold the `session.json` that its maker writes last.
 
     Returns
     -------
@@ -860,7 +788,7 @@ def open_session(path: Path | str) -> Session:
         If there is no such session or it is incomplete; the message lists the sessions beside it.
     """
     root = Path(os.path.abspath(path))
-    files = ["radar.timestamps"] + (["session.json"] if root.name.startswith("virtual-") else [])
+    files = ["radar.timestamps"] + (["session.json"] if root.name.startswith("sim-") else [])
     missing = [] if (root / "radar").is_dir() else ["radar"]
     missing += [name for name in files if not (root / name).is_file()]
     if missing:

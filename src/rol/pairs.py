@@ -21,8 +21,10 @@ import numpy as np
 
 try:
     from .files import prepare_images, read_text, write_bytes, write_text
+    from .geometry import log
 except ImportError:  # this file was copied on its own
     from files import prepare_images, read_text, write_bytes, write_text
+    from geometry import log
 
 SIDES = ("radar", "lidar")
 
@@ -97,12 +99,7 @@ def estimate_twists(odometry: Any) -> np.ndarray:
     if (later <= earlier).any() or (later[:-1] != earlier[1:]).any():
         raise ValueError("odometry: steps do not form one chain forward in time")
     seconds = (later - earlier) / 1e6
-    half = steps[:, 2] / 2.0
-    # Constant twist moves on an arc: the chord turned back by half the yaw, stretched to the arc's length.
-    stretch = 1.0 / np.sinc(half / np.pi)
-    vx = (np.cos(half) * steps[:, 0] + np.sin(half) * steps[:, 1]) * stretch
-    vy = (np.cos(half) * steps[:, 1] - np.sin(half) * steps[:, 0]) * stretch
-    rates = np.stack([vx, vy, steps[:, 2]], axis=1) / seconds[:, None]
+    rates = log(steps) / seconds[:, None]
     weight = (seconds[1:] / (seconds[:-1] + seconds[1:]))[:, None]
     return np.concatenate([rates[:1], weight * rates[:-1] + (1.0 - weight) * rates[1:], rates[-1:]])
 

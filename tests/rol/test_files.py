@@ -98,14 +98,13 @@ def test_other_encodings_are_named(tmp_path: Path) -> None:
     [
         ("1.0 0 0 0 0 0 0 1\n2.0 0 0 0 0 0 0 1\n", lambda path: evaluation.read_tum(path)[1].shape),
         ("1 1\n2 1\n", lambda path: oxford.load_timestamps(path)[0].tolist()),
-        ("0 0 0 0 0 0\n", lambda path: oxford.load_extrinsics(path).tolist()),
         (
             ",".join(oxford.ODOMETRY_COLUMNS) + "\n375000,125000,1,0,0,0,0,0,250000,1\n",
             lambda path: oxford.load_radar_odometry(path).steps.tolist(),
         ),
         ("1 2 3\n", lambda path: rall.load_poses(path).tolist()),
         ("timestamp_us,x_m,y_m,yaw_rad\n1,0,0,0\n", lambda path: list(rall.load_scan_poses(path))),
-        ("virtual: {sessions: {virtual-a: {start: 2019-01-10T11:46:21, scans: 3}}}\n", load_settings),
+        ("simulated: {sessions: {sim-a: {start: 2019-01-10T11:46:21, scans: 3}}}\n", load_settings),
         (json.dumps(METRICS), evaluation.read_metrics),
         ((ROOT / "config" / "demo.yaml").read_text(encoding="utf-8"), chapters.load_config),
     ],

@@ -80,33 +80,42 @@ def test_transform_points():
     assert_allclose(back, points, atol=1e-12)
 
 
-def test_interpolation_takes_the_short_way_round():
-    poses = [[0, 0, np.deg2rad(170)], [4, 8, np.deg2rad(-170)]]
-    at = geometry.interpolate_poses([1000, 2000], poses, [1000, 1250, 1500, 2000])
-    assert_allclose(at[:, :2], [[0, 0], [1, 2], [2, 4], [4, 8]], atol=1e-12)
-    turned = geometry.wrap_angle(at[:, 2] - np.deg2rad([170, 175, 180, -170]))
-    assert_allclose(turned, 0, atol=1e-12)
+def test_exp_in_closed_form():
+    assert_allclose(geometry.exp([2.0, 0.0, 0.0], 3.0), [6.0, 0.0, 0.0])
+    assert_allclose(geometry.exp([1.0, 0.0, QUARTER]), [1 / QUARTER, 1 / QUARTER, QUARTER])
+    # A sideways velocity, one second back: a quarter turn clockwise on a circle of the same radius.
+    assert_allclose(geometry.exp([0.0, 1.0, QUARTER], [-1.0]), [[-1 / QUARTER, -1 / QUARTER, -QUARTER]])
 
 
-def test_interpolation_keeps_microseconds_of_real_stamps():
-    stamps = np.array([1547120788016733, 1547120788264696])
-    at = geometry.interpolate_poses(stamps, [[0, 0, 0], [247963, 0, 0]], stamps[:1] + 1)
-    assert_allclose(at, [[1, 0, 0]], atol=1e-6)
+def test_exp_is_the_limit_of_many_small_steps():
+    twist, n = np.array([[9.0, -0.4, 0.7], [-3.0, 0.2, -2.0]]), 100_000
+    for one, pose in zip(twist, geometry.exp(twist, 0.5), strict=True):
+        poses = geometry.accumulate_steps(np.tile(one * 0.5 / n, (n, 1)))
+        assert_allclose(poses[-1], pose, atol=2e-5)
 
 
-@pytest.mark.parametrize("query", [999, 2001])
-def test_interpolation_refuses_to_extrapolate(query):
-    with pytest.raises(ValueError, match=f"{query} us lies outside .* 1000 .. 2000"):
-        geometry.interpolate_poses([1000, 2000], np.zeros((2, 3)), [1500, query])
+def test_log_inverts_exp_for_less_than_a_full_turn():
+    twists = np.random.default_rng(4).uniform([-20, -2, -6.2], [20, 2, 6.2], (200, 3))
+    assert_allclose(geometry.log(geometry.exp(twists)), twists, atol=1e-9)
+    assert_allclose(geometry.exp(geometry.log([1.5, 0.1, 0.0])), [1.5, 0.1, 0.0], atol=1e-15)
+    assert geometry.log(twists.reshape(10, 20, 3)).shape == (10, 20, 3)
 
 
-def test_interpolation_refuses_bad_times_and_poses():
-    with pytest.raises(ValueError, match="do not increase at index 2"):
-        geometry.interpolate_poses([1, 3, 3], np.zeros((3, 3)), [2])
-    with pytest.raises(ValueError, match="3 stamps for 2 poses"):
-        geometry.interpolate_poses([1, 2, 3], np.zeros((2, 3)), [2])
-    with pytest.raises(ValueError, match="0 stamps for 0 poses"):
-        geometry.interpolate_poses([], np.zeros((0, 3)), [2])
+def test_check_points_names_what_is_wrong():
+    for points in (np.zeros(3), np.zeros((4, 3)), np.zeros((4, 1))):
+        with pytest.raises(ValueError, match=r"cloud: expected points of shape \(n, 2\), got"):
+            geometry.check_points(points, "cloud")
+    with pytest.raises(KeyError, match="map: point 1 is not finite"):
+        geometry.check_points([[0, 0], [0, np.inf], [np.nan, 0]], "map", error=KeyError)
+    with pytest.raises(ValueError, match=r"points of shape \(n, 3\) or more columns, got \(4, 2\)"):
+        geometry.check_points(np.zeros((4, 2)), columns=3, more=True)
+
+
+def test_check_points_gives_float64():
+    points = geometry.check_points(np.array([[1, 2, np.nan], [3, 4, 0]], np.float32).T[:2].T)
+    assert points.dtype == np.float64 and points.flags.c_contiguous and points.tolist() == [[1, 2], [3, 4]]
+    assert geometry.check_points([[1, 2, np.nan]], more=True).shape == (1, 3)
+    assert geometry.check_points([]).shape == (0, 2)
 
 
 def test_check_poses_names_what_is_wrong():
@@ -127,7 +136,7 @@ def test_check_poses_names_what_is_wrong():
     ],
 )
 def test_rotation_moves_the_axes_as_worked_out_by_hand(angles, forward, left, up):
-    R = geometry.rotation_from_euler(*angles)
+    R = geometry.transform_from_euler(0, 0, 0, *angles)[:3, :3]
     assert_allclose(R, np.array([forward, left, up]).T, atol=1e-12)
 
 
@@ -138,14 +147,6 @@ def test_transform_from_euler_and_points_in_space():
         [[1, 3, 3], [0, 2, 8]],
         atol=1e-12,
     )
-
-
-def test_flip_y_z_mirrors_y_z_pitch_and_yaw():
-    T = geometry.transform_from_euler(1, 2, 3, 0.1, 0.2, 0.3)
-    assert_allclose(
-        geometry.flip_y_z(T), geometry.transform_from_euler(1, -2, -3, 0.1, -0.2, -0.3), atol=1e-12
-    )
-    assert_allclose(geometry.flip_y_z(geometry.flip_y_z(T)), T, atol=1e-12)
 
 
 def test_first_of_cells_by_hand():

@@ -9,7 +9,7 @@ import pytest
 
 from rol import pairs
 from rol.bev import image_to_points
-from rol.geometry import accumulate_steps, relative_pose
+from rol.geometry import accumulate_steps, exp, relative_pose
 from rol.oxford import EXTRINSICS, RadarScan, Session, save_radar, save_velodyne_binary
 from rol.pairs import (
     PairDataset,
@@ -25,7 +25,6 @@ from rol.pairs import (
     save_pair,
     write_pairs,
 )
-from rol.radar import twist_to_pose
 
 STAMP = 1_547_000_000_000_000
 
@@ -76,7 +75,7 @@ def test_constant_twist_in_closed_form():
     """At a constant twist the velocity comes out exactly, however uneven the times."""
     twist = np.array([8.0, -0.4, 0.5])
     times = np.array([0, 250_000, 490_000, 760_000, 1_000_000]) + STAMP
-    poses = twist_to_pose(twist, (times - STAMP) / 1e6)
+    poses = exp(twist, (times - STAMP) / 1e6)
     np.testing.assert_allclose(estimate_twists(chain(poses, times)), np.tile(twist, (5, 1)), atol=1e-9)
 
 

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from rol import radar
+from rol.geometry import exp
 from rol.radar import (
     cfar_peaks,
     compensate_points,
@@ -16,7 +17,6 @@ from rol.radar import (
     peaks_to_points,
     polar_to_cartesian,
     row_seconds,
-    twist_to_pose,
     undistort_points,
 )
 
@@ -163,7 +163,7 @@ def simulate_dot(twist, place, doppler_seconds, n_bins=2000, resolution=0.05):
     """A scan of one resting target, seen by a radar at constant twist; place in the frame at mid-scan."""
     codes = np.zeros((400, n_bins), dtype=np.uint8)
     for row, t in enumerate(row_seconds(400)):
-        x, y, yaw = twist_to_pose(twist, t)
+        x, y, yaw = exp(twist, t)
         dx, dy = place[0] - x, place[1] - y
         bearing = math.atan2(dy, dx) - yaw
         off = abs((bearing - AZIMUTHS[row] + math.pi) % (2 * math.pi) - math.pi)
@@ -202,14 +202,6 @@ def test_zero_twist_changes_nothing():
     plain = polar_to_cartesian(codes, AZIMUTHS, width=100)
     still = polar_to_cartesian(codes, AZIMUTHS, width=100, twist=(0.0, 0.0, 0.0), doppler_seconds=0.049)
     np.testing.assert_allclose(still, plain, atol=1e-3)
-
-
-def test_twist_to_pose_in_closed_form():
-    np.testing.assert_allclose(twist_to_pose((2.0, 0.0, 0.0), 3.0), [6.0, 0.0, 0.0])
-    np.testing.assert_allclose(twist_to_pose((1.0, 0.0, np.pi / 2), 1.0), [2 / np.pi, 2 / np.pi, np.pi / 2])
-    np.testing.assert_allclose(
-        twist_to_pose((0.0, 1.0, np.pi / 2), [-1.0]), [[-2 / np.pi, -2 / np.pi, -np.pi / 2]]
-    )
 
 
 def test_undistort_points():
