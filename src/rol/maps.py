@@ -19,9 +19,11 @@ from scipy.spatial import cKDTree
 try:
     from .files import write_bytes
     from .geometry import check_grid, check_poses, compose, transform_points
+    from .odometry import IcpSettings, icp_2d
 except ImportError:  # this file was copied on its own
     from files import write_bytes
     from geometry import check_grid, check_poses, compose, transform_points
+    from odometry import IcpSettings, icp_2d
 
 
 _WAITING_POINTS = 50_000  # so many points are added to a map at once
@@ -185,26 +187,15 @@ def register_maps(
     MapError
         If a map is empty.
     """
-    try:
-        from .odometry import icp_2d
-    except ImportError:  # this file was copied on its own: odometry.py is wanted beside it
-        from odometry import icp_2d
     for points, name in ((source, "source"), (target, "target")):
         if len(points) == 0:
             raise MapError(f"the {name} map is empty")
     pose, done, converged = check_poses(init, "initial guess"), [], False
     for reach, max_distance, min_distance, cell in stages:
         near = thin_points(source[np.hypot(source[:, 0], source[:, 1]) < reach], cell)[0]
-        result = icp_2d(
-            near,
-            thin_points(target, cell)[0],
-            pose,
-            max_distance=max_distance,
-            min_distance=min_distance,
-            max_iterations=max_iterations,
-            tolerance=1e-4,
-            max_points=len(near),
-        )
+        limits = {"max_distance": max_distance, "min_distance": min_distance, "tolerance": 1e-4}
+        settings = IcpSettings(**limits, max_iterations=max_iterations, max_points=max(len(near), 1))
+        result = icp_2d(near, thin_points(target, cell)[0], pose, settings)
         pose, converged = result.T_target_source, result.converged
         done.append((reach, max_distance, result.rmse_m, pose))
     distances = cKDTree(target).query(transform_points(pose, source))[0]

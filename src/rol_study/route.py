@@ -338,7 +338,7 @@ def run_registration(
     map_points : array, shape (m, 2)
         The map [m].
     **settings
-        Of `rol.odometry.follow_map`.
+        Of `rol_beyond.scan_matching.scan_to_map_icp`.
 
     Returns
     -------
@@ -347,10 +347,10 @@ def run_registration(
         particles (NaN, NaN and 0). Yin et al. 2020, Sec. III-B.
     """
     from rol.evaluation import FailureRule, FailureWatch
-    from rol.odometry import follow_map
+    from rol_beyond.scan_matching import scan_to_map_icp
 
     watch = FailureWatch(route.stamps_us, route.truth, rule or FailureRule())
-    registering = follow_map(route.steps, clouds, map_points, route.truth[0], watch, **settings)
+    registering = scan_to_map_icp(route.steps, clouds, map_points, route.truth[0], watch, **settings)
     nothing = np.full((3, 3), np.nan)
     rows, times = _gather(registering, lambda r: (r.T_target_source, nothing, not r.converged, np.nan, 0))
     return RouteRun(*rows[:2], watch.failures, *rows[2:], times)
