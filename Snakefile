@@ -5,8 +5,8 @@
 #   snakemake -c2 -n                                  only say what would run, and why
 #
 # A run is out of date when the code it uses, its parameters or its inputs changed. Code means the notebook's code cells
-# and the modules of src/rol that it imports, without comments and docstrings: they enter as a digest in `params`, so
-# editing a text reruns no notebook (the book takes the new text all the same).
+# and the modules under src that it imports, without comments and docstrings, and the versions in requirements.lock: they
+# enter as a digest in `params`, so editing a text reruns no notebook (the book takes the new text all the same).
 
 import json
 import os
@@ -33,7 +33,7 @@ RUNS = chapters.all_runs(config)
 PARAMETERS = {run: chapters.run_parameters(config, run) for run in RUNS}  # a name that a notebook lacks ends here
 DIGESTS = {chapter: chapters.chapter_digest(NOTEBOOKS / f"{chapter}.ipynb") for chapter in chapters.CHAPTERS}
 TRANSLATION = chapters.translation(config)  # network and options of the generated images, those of chapter 05
-RECIPES = (config["virtual"] or {}).get("sessions", {})
+RECIPES = (config["simulated"] or {}).get("sessions", {})
 SHIPPED = [str(path) for path in sorted(Path("data/weights").glob("[!.]*.safetensors"))]  # networks that come with the book
 PYTHON, JUPYTER_BOOK = sys.executable, Path(sys.executable).with_name("jupyter-book")
 
@@ -54,7 +54,7 @@ wildcard_constraints:
 
 
 def session_made(session):
-    """Name the file that says a session is there; a virtual one is made by its rule, a real one must be on disk."""
+    """Name the file that says a session is there; a simulated one is made by its rule, a real one must be on disk."""
     if session in RECIPES:
         return f"{SESSIONS_ROOT}/{session}/session.json"
     stamps = f"{SESSIONS_ROOT}/{session}/radar.timestamps"
@@ -64,8 +64,8 @@ def session_made(session):
 
 
 def recipe(session):
-    """Give what a virtual session depends on: the settings common to all and its own."""
-    return {**config["virtual"], "sessions": {session: RECIPES[session]}}
+    """Give what a simulated session depends on: the settings common to all and its own."""
+    return {**config["simulated"], "sessions": {session: RECIPES[session]}}
 
 
 def executed(chapter, folder=f"{OUT}/notebooks"):
@@ -98,7 +98,7 @@ rule book:
         notebooks=[run.path(OUT) for run in RUNS],
         sources=[f"notebooks/{chapter}.ipynb" for chapter in chapters.CHAPTERS],
         pages=[str(path) for path in sorted(Path("book").rglob("[!.]*")) if path.is_file()],
-        modules=[str(path) for path in sorted(Path("src/rol").rglob("[!.]*.py"))],
+        modules=[str(path) for path in sorted(Path("src").rglob("[!.]*.py"))],
         stage=["workflow/stage_book.py", "workflow/toolbox_pages.py", "workflow/check.py"],
         reference=[str(path) for path in sorted(Path("data/reference").glob("[!.]*.json"))],
     output:
@@ -121,22 +121,22 @@ rule chapters:
         [run.path(OUT) for run in RUNS],
 
 
-rule virtual_session:
+rule simulated_session:
     output:
         SESSIONS_ROOT + "/{session}/session.json",
     log:
         SESSIONS_ROOT + "/{session}.log",
     params:
         recipe=lambda wildcards: json.dumps(recipe(wildcards.session), sort_keys=True),
-        code=chapters.virtual_digest(),
+        code=chapters.simulator_digest(),
         made=SESSIONS_ROOT + "/{session}",
     message:
-        "virtual session {wildcards.session}"
+        "simulated session {wildcards.session}"
     shell:  # the writer goes on with what is there, which is right after a stop and wrong after a change of its code
         'made={params.made:q}; [ "$(cat "$made.code" 2>/dev/null)" = {params.code} ] '
         """|| ! grep -qs '"format":' "$made/settings.json" || rm -rf "$made"; """
         'echo {params.code} > "$made.code"; '
-        + ENVIRONMENT + "{PYTHON:q} -m rol_sim {CONFIG_FILE:q} --session {wildcards.session:q} --out {SESSIONS_ROOT:q} "
+        + ENVIRONMENT + "{PYTHON:q} -m {chapters.SIMULATOR} {CONFIG_FILE:q} --session {wildcards.session:q} --out {SESSIONS_ROOT:q} "
         "> {log:q} 2>&1 || {{ tail -n 30 {log:q}; exit 1; }}"
 
 

@@ -5,7 +5,7 @@ python benchmarks/chain.py [--real-root DIR] [--rounds 2] [--threads 2]
 
 Each scan goes through a front end (raw peaks, or a network and the points of its image), the book's odometry, and one
 update of the filter `rol` on the map, as they would come from a car: no scan is known before its turn. The scans are
-the real ones in a row, again and again, for as many rounds; without the real data, the first of a virtual session, and
+the real ones in a row, again and again, for as many rounds; without the real data, the first of a simulated session, and
 random streets for a map. Times are medians over the scans, for each part; the rate is that of the parts' sum. What
 poses come out is no matter here. The paper's network at its full width has random weights, which cost the same; what it
 draws is of no use, so raw peaks are handed on in its place.
@@ -29,8 +29,8 @@ from translator import ROOT, describe_machine
 from rol import mcl
 from rol.files import write_text
 from rol.oxford import load_radar, load_timestamps
-from rol.pix2pix import ResnetGenerator, has_bf16
-from rol_beyond.front_ends import Translator, detect_points, load_translator, translate_scan
+from rol.pix2pix import ResnetGenerator, TrainedNetwork, has_bf16, load_network
+from rol_beyond.front_ends import detect_points, translate_scan
 from rol_beyond.local_map_odometry import local_map_odometry
 from rol_beyond.motion import MotionModel, mover
 from rol_book.parameters import positive
@@ -43,18 +43,18 @@ Scan = tuple[np.ndarray, np.ndarray]
 FrontEnd = Callable[[np.ndarray, np.ndarray], np.ndarray]
 
 
-def open_scans(given: str, n_virtual: int = 11) -> tuple[list[Scan], str]:
+def open_scans(given: str, n_simulated: int = 11) -> tuple[list[Scan], str]:
     """Codes and bearings of the scans, and what they are."""
     root = rall.find_real_root(given)
     if root is not None:
         scans = rall.load_scans(root)
         return [(scan.codes, scan.azimuths) for scan in scans], f"{len(scans)} real scans"
-    folder = ROOT / "data" / "sessions" / "demo" / "virtual-town-seq01"
+    folder = ROOT / "data" / "sessions" / "demo" / "sim-town-seq01"
     if not folder.is_dir():
         raise SystemExit(f"{folder}: missing, and no real data at hand; `make book` makes the session")
-    stamps_us = load_timestamps(folder / "radar.timestamps")[:n_virtual]
+    stamps_us = load_timestamps(folder / "radar.timestamps")[:n_simulated]
     loaded = [load_radar(folder / "radar" / f"{us}.png") for us in stamps_us]
-    return [(scan.codes, scan.azimuths) for scan in loaded], f"{len(loaded)} virtual scans"
+    return [(scan.codes, scan.azimuths) for scan in loaded], f"{len(loaded)} simulated scans"
 
 
 def list_front_ends(full_width: int = 64) -> dict[str, FrontEnd]:
@@ -62,10 +62,10 @@ def list_front_ends(full_width: int = 64) -> dict[str, FrontEnd]:
     ends: dict[str, FrontEnd] = {"raw peaks": detect_points}
     weights = ROOT / "data" / "weights"
     for words, (name, headings) in NETWORKS.items():
-        ends[words] = translate(load_translator(weights / f"{name}.safetensors"), headings)
-    narrow = load_translator(weights / "paper.safetensors")
+        ends[words] = translate(load_network(weights / f"{name}.safetensors"), headings)
+    narrow = load_network(weights / "paper.safetensors")
     full = ResnetGenerator(full_width, blocks=9).eval()
-    wide = translate(Translator(full, narrow.points, narrow.settings, {}), 1)
+    wide = translate(TrainedNetwork(full, narrow.points, narrow.settings, {}), 1)
     ends["network paper, full width"] = lambda codes, azimuths: (
         wide(codes, azimuths),
         detect_points(codes, azimuths),
@@ -73,7 +73,7 @@ def list_front_ends(full_width: int = 64) -> dict[str, FrontEnd]:
     return ends
 
 
-def translate(translator: Translator, headings: int | None) -> FrontEnd:
+def translate(translator: TrainedNetwork, headings: int | None) -> FrontEnd:
     """A network as a front end."""
     made = partial(translate_scan, translator, bf16=has_bf16(), headings=headings)
     return lambda codes, azimuths: made(codes, azimuths)[0]

@@ -3,7 +3,7 @@
 python benchmarks/odometry.py [--results build/demo] [--sessions data/sessions/demo] [--real-root DIR]
                                                         prints a table and writes data/performance/odometry.json
 
-All get the same fake clouds of the virtual sessions that `make book` left, and one thread. The paper's ICP and the
+All get the same fake clouds of the simulated sessions that `make book` left, and one thread. The paper's ICP and the
 peers align each cloud to the one before and guess that the car goes on as it went; ours aligns it to the clouds of the
 last metres. Ways take turns scan by scan, so that a busy machine hurts all alike; medians. All that a way makes of a
 cloud is timed with it: trees, normals, corrections, copies into its own types. Drift is that of the KITTI benchmark,
@@ -190,9 +190,9 @@ def load_session(fakes: Path, session: Path) -> tuple[Clouds, np.ndarray, np.nda
 
 def find_sessions(results: Path, sessions: Path) -> dict[str, tuple[Clouds, np.ndarray, np.ndarray]]:
     """Load every localization session that has fakes."""
-    folders = sorted(path.parent for path in (results / "fake").glob("virtual-*-seq*/fake.json"))
+    folders = sorted(path.parent for path in (results / "fake").glob("sim-*-seq*/fake.json"))
     if not folders:
-        raise ValueError(f"{results / 'fake'}: no fakes of sessions virtual-*-seq*; `make book` makes them")
+        raise ValueError(f"{results / 'fake'}: no fakes of sessions sim-*-seq*; `make book` makes them")
     return {folder.name: load_session(folder, sessions / folder.name) for folder in folders}
 
 

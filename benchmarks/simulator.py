@@ -1,9 +1,9 @@
-"""How fast virtual sensors are, and where the time goes.
+"""How fast simulated sensors are, and where the time goes.
 
 python benchmarks/simulator.py [--scans 40]      prints a table and writes build/benchmarks/simulator.json
 
 Medians over scans of one process on one thread; the sessions of a drive are written by as many processes as wanted. With
-the real data at hand the world is that of the route, without them the virtual town.
+the real data at hand the world is that of the route, without them the simulated town.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ from rol_book.parameters import positive
 from rol_data import rall
 from rol_sim.sensors import radar as radar_sensor
 from rol_sim.sensors import radar_signal
-from rol_sim.session.assembly import VirtualSession, build_session, make_scan, make_sweep, sensor_settings
+from rol_sim.session.assembly import SimulatedSession, build_session, make_scan, make_sweep, sensor_settings
 from rol_sim.session.settings import load_settings
 
 ROOT = Path(__file__).resolve().parents[1]
 
 
-def open_drive() -> tuple[VirtualSession, float]:
+def open_drive() -> tuple[SimulatedSession, float]:
     """Build a session of the route, or of the town without the real data; gives also the seconds it took."""
     config = "route" if rall.find_real_root() else "demo"
     settings = load_settings(ROOT / "config" / f"{config}.yaml")
@@ -38,7 +38,7 @@ def open_drive() -> tuple[VirtualSession, float]:
     return session, perf_counter() - begin
 
 
-def time_scan(session: VirtualSession, index: int, folder: Path) -> dict[str, float]:
+def time_scan(session: SimulatedSession, index: int, folder: Path) -> dict[str, float]:
     """Time the parts of one radar scan [ms]."""
     settings = sensor_settings(session.settings)[1]
     stamp, turn = int(session.scans_us[index]), int(session.turns_us[index])
@@ -65,7 +65,7 @@ def time_scan(session: VirtualSession, index: int, folder: Path) -> dict[str, fl
     return {name: 1000.0 * float(value) for name, value in found.items()}
 
 
-def time_sweep(session: VirtualSession, index: int, folder: Path) -> dict[str, float]:
+def time_sweep(session: SimulatedSession, index: int, folder: Path) -> dict[str, float]:
     """Time one lidar sweep [ms]."""
     begin = perf_counter()
     sweep = make_sweep(session, "velodyne_left", index)
@@ -77,7 +77,7 @@ def time_sweep(session: VirtualSession, index: int, folder: Path) -> dict[str, f
 
 def main() -> None:
     """Measure, print, and write the table."""
-    parser = argparse.ArgumentParser(description="How fast virtual sensors are, and where the time goes.")
+    parser = argparse.ArgumentParser(description="How fast simulated sensors are, and where the time goes.")
     parser.add_argument("--scans", type=positive, default=40)
     given = parser.parse_args()
     session, built_s = open_drive()

@@ -10,6 +10,7 @@ import ast
 import hashlib
 import io
 import json
+import re
 import shlex
 import tokenize
 from collections.abc import Iterable
@@ -24,7 +25,9 @@ from rol.files import read_text
 
 ROOT = Path(__file__).resolve().parents[1]
 NOTEBOOKS = ROOT / "notebooks"
-PACKAGE = ROOT / "src" / "rol"
+SOURCE = ROOT / "src"  # of all packages
+LOCK = ROOT / "requirements.lock"
+SIMULATOR = "rol_sim"  # writes a simulated session when it is run as a module
 
 # How often a chapter runs: once in all, once for each session, or once for each localization session and method.
 CHAPTERS = {
@@ -50,7 +53,7 @@ CONFIG_KEYS = {
     "book_dir",
     "seed",
     "notebooks",
-    "virtual",
+    "simulated",
 }
 OPTIONAL_KEYS = {"real_root"}
 
@@ -279,78 +282,113 @@ def code_cells(notebook: nbformat.NotebookNode) -> list[str]:
 
 
 @cache
-def imported_modules(source: str, package: tuple[str, ...] = ()) -> frozenset[tuple[str, ...]]:
-    """List the names below ``rol`` that a piece of source imports, as paths such as ``("virtual", "scene")``.
+def imported_names(source: str, package: tuple[str, ...] = ()) -> frozenset[tuple[str, ...]]:
+    """List the absolute names that a piece of source imports, as paths such as ``("rol", "mcl", "localize")``.
 
     Parameters
     ----------
     source : str
         Python source; lines of IPython's magic are left out.
     package : tuple of str
-        Where the source stands below ``rol``, to resolve relative imports.
+        Package that the source belongs to, to resolve relative imports.
     """
     plain = "\n".join(line for line in source.splitlines() if not line.lstrip().startswith(("%", "!")))
     found = set()
     for node in ast.walk(ast.parse(plain)):
         if isinstance(node, ast.Import):
-            names = [tuple(alias.name.split(".")) for alias in node.names]
+            found |= {tuple(alias.name.split(".")) for alias in node.names}
         elif isinstance(node, ast.ImportFrom):
-            base = tuple(node.module.split(".")) if node.module else ()
-            if node.level:
-                base = ("rol", *package[: len(package) - node.level + 1], *base)
-            names = [base] + [(*base, alias.name) for alias in node.names]
-        else:
-            continue
-        found |= {name[1:] for name in names if name[:1] == ("rol",)}
+            base = package[: len(package) - node.level + 1] if node.level else ()
+            base += tuple(node.module.split(".")) if node.module else ()
+            found |= {(*base, alias.name) for alias in node.names}
     return frozenset(found)
 
 
-def module_files(sources: Iterable[str], package_root: Path = PACKAGE) -> list[Path]:
-    """List the files of ``rol`` that pieces of source use, directly or through one another."""
+def files_of_import(name: tuple[str, ...]) -> list[Path]:
+    """List the files that an import runs: each package on its path, then the module; none if a part is missing."""
+    files: list[Path] = []
+    for n, part in enumerate(name, start=1):
+        place = SOURCE.joinpath(*name[:n])
+        if (place / "__init__.py").is_file():
+            files.append(place / "__init__.py")
+        elif place.with_suffix(".py").is_file():
+            return [*files, place.with_suffix(".py")]  # what follows is a name in the module
+        else:
+            is_last = files and n == len(name)
+            is_name = is_last and part in ("*", *re.findall(r"\w+", code_text(read_text(files[-1]))))
+            return files if is_name else []
+    return files
+
+
+def module_files(sources: Iterable[str], user: str) -> list[Path]:
+    """List the files under ``src`` that pieces of source use, directly or through one another.
+
+    Every folder of ``src`` with an ``__init__.py`` is a package. A name that begins with ``rol`` is always taken for
+    one, so that a package that has been moved or renamed is an error and not left out.
+
+    Parameters
+    ----------
+    sources : iterable of str
+        Python source.
+    user : str
+        File that the sources belong to, for the message of an error.
+
+    Raises
+    ------
+    ChapterError
+        If an import of a package of this project leads to no file; names the importing file and the import.
+    """
+    packages = {file.parent.name for file in SOURCE.glob("[!.]*/__init__.py")}
     found: set[Path] = set()
-    waiting = [name for source in sources for name in imported_modules(source)]
+    waiting = [(user, name) for source in sources for name in imported_names(source)]
     while waiting:
-        name = waiting.pop()
-        for file in (
-            package_root.joinpath(*name, "__init__.py"),
-            package_root.joinpath(*name).with_suffix(".py"),
-        ):
-            if file.is_file() and file not in found:
-                found.add(file)
-                package = file.parent.relative_to(package_root).parts
-                waiting += imported_modules(file.read_text(encoding="utf-8"), package)
+        user, name = waiting.pop()
+        if name[0] not in packages and not name[0].startswith("rol"):
+            continue
+        files = files_of_import(name)
+        if not files:
+            raise ChapterError(
+                f"{user}: imports `{'.'.join(name)}`, which is no module or name under {SOURCE.name}"
+            )
+        for file in set(files) - found:
+            found.add(file)
+            package = file.parent.relative_to(SOURCE).parts
+            waiting += [(str(file), used) for used in imported_names(read_text(file), package)]
     return sorted(found)
 
 
 def digest(texts: Iterable[str]) -> str:
-    """Give a short digest of several texts."""
-    return hashlib.sha256("\0".join(texts).encode()).hexdigest()[:16]
+    """Compute a short digest of several texts and of the versions in the lock file."""
+    versions = [line for line in read_text(LOCK).splitlines() if not line.startswith("#")]
+    return hashlib.sha256("\0".join([*texts, *versions]).encode()).hexdigest()[:16]
+
+
+def code_of(files: Iterable[Path]) -> list[str]:
+    """Read the code of files, without comments and docstrings."""
+    return [code_text(read_text(file)) for file in files]
 
 
 def chapter_digest(path: str | Path) -> str:
-    """Give the digest of a notebook's code and of the modules it uses; text, comments and outputs do not count."""
+    """Compute the digest of a notebook's code, the modules it uses and the lock file; text and outputs do not count."""
     cells = code_cells(read_notebook(path))
-    return digest([*cells, *(code_text(file.read_text(encoding="utf-8")) for file in module_files(cells))])
+    return digest([*cells, *code_of(module_files(cells, str(path)))])
 
 
-def virtual_digest() -> str:
-    """Give the digest of all code that makes virtual sessions."""
-    files = module_files(["import rol_sim.__main__"])
-    return digest(code_text(file.read_text(encoding="utf-8")) for file in files)
+def simulator_digest() -> str:
+    """Compute the digest of all code that writes simulated sessions, and of the lock file."""
+    return digest(code_of(module_files([f"import {SIMULATOR}.__main__"], "workflow/chapters.py")))
 
 
 def script_digest(name: str) -> str:
-    """Give the digest of a script of the workflow and of the modules it uses."""
-    script = (ROOT / "workflow" / name).read_text(encoding="utf-8")
-    return digest(
-        code_text(text) for text in [script, *(f.read_text(encoding="utf-8") for f in module_files([script]))]
-    )
+    """Compute the digest of a script of the workflow, the modules it uses and the lock file."""
+    script = ROOT / "workflow" / name
+    return digest(code_of([script, *module_files([read_text(script)], f"workflow/{name}")]))
 
 
 def stored_digest(notebook: nbformat.NotebookNode, config: dict) -> str:
-    """Give the digest that a stored notebook carries: its code, all of ``src/rol``, and the profile it was run with."""
-    package = [code_text(file.read_text(encoding="utf-8")) for file in sorted(PACKAGE.rglob("[!.]*.py"))]
-    return digest([*code_cells(notebook), *package, json.dumps(config, sort_keys=True)])
+    """Compute the digest that a stored notebook carries: of its code, all packages, the lock file and its profile."""
+    packages = code_of(sorted(SOURCE.rglob("[!.]*.py")))
+    return digest([*code_cells(notebook), *packages, json.dumps(config, sort_keys=True)])
 
 
 # ---- executed notebooks ---------------------------------------------------------------------------------------

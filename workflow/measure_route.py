@@ -172,15 +172,15 @@ def measure_outliers(real_root: str, number: str, share: float, seed: int) -> li
 
 
 def measure_rendered(real_root: str, number: str, first: int, n_scans: int, seed: int) -> list[dict]:
-    """Both methods with the virtual radar through the translator, on a stretch where it never learnt."""
+    """Both methods with the simulated radar through the translator, on a stretch where it never learnt."""
     import torch
 
-    from rol_beyond.front_ends import load_translator
+    from rol.pix2pix import load_network
     from rol_study.rendered_points import render_clouds
 
     torch.set_num_threads(1)
     stage = stage_of(real_root, number, (0.80, 0.88))
-    translator = load_translator(ROOT / "data" / "weights" / "rol.safetensors")
+    translator = load_network(ROOT / "data" / "weights" / "rol.safetensors")
     clouds = list(render_clouds(real_root, number, first, n_scans, translator, seed))
     truth, steps = stage.route.truth[first : first + n_scans], stage.route.steps[first : first + n_scans - 1]
     part = replace(stage, route=Route(number, truth, steps))

@@ -42,7 +42,7 @@ GLUED_KIND = "{glue:text}`kind`"
 # The picture of the first page is taken from a run: the first of these that there is, and what the page says of it.
 RESULT_FIGURES = (
     ("10_real_radar", "fig-story", "real.md"),
-    ("07_localization", "fig-trajectory", "virtual.md"),
+    ("07_localization", "fig-trajectory", "simulated.md"),
 )
 
 
@@ -91,7 +91,7 @@ def number_title(notebook: nbformat.NotebookNode, page: str) -> None:
 
 
 def complete_captions(notebook: nbformat.NotebookNode, kind: str) -> None:
-    """Add to the captions of figures that show the sessions whether those are virtual or real (in place).
+    """Add to the captions of figures that show the sessions whether those are simulated or real (in place).
 
     The metadata of every figure's cell state in `data` what the figure shows. Only "session" depends on the profile;
     the captions of the others name their data themselves, as do those that glue in the `kind`.
@@ -162,7 +162,7 @@ def stage_notebooks(config: dict, book: Path) -> None:
     """Copy the executed notebooks that the book shows; a run with a fault ends the staging."""
     pages = book_pages(config)
     seen: set[str] = set()
-    kind = "Virtual" if all(session.startswith("virtual-") for session in config["sessions"]) else "Real"
+    kind = "Simulated" if all(session.startswith("sim-") for session in config["sessions"]) else "Real"
     (book / "notebooks").mkdir()
     for page, run in pages.items():
         notebook = load_run(run.path(config["out_dir"]), NOTEBOOKS / f"{run.chapter}.ipynb")
@@ -196,7 +196,7 @@ def read_figure(notebook: Path, name: str) -> bytes | None:
 
 
 def stage_result_figure(config: dict, book: Path) -> None:
-    """Write the picture of the first page, and the words below it: real data where they are at hand, else virtual."""
+    """Write the picture of the first page, and the words below it: real data where they are at hand, else simulated."""
     for chapter, name, words in RESULT_FIGURES:
         run = next((run for run in book_pages(config).values() if run.chapter == chapter), None)
         png = read_figure(run.path(config["out_dir"]), name) if run else None

@@ -12,9 +12,10 @@ import shutil
 from dataclasses import dataclass
 from pathlib import Path
 
-from chapters import PACKAGE, ChapterError
+from chapters import SOURCE, ChapterError
 from rol.files import read_text, write_text
 
+PACKAGE = SOURCE / "rol"
 SECTION = re.compile(r"^(Parameters|Attributes|Returns|Yields|Raises|Notes)\n-+$", re.MULTILINE)
 FOLDER = "Part of the folder `virtual`, which is copied whole: [what it needs, and an example](../take.md#virtual)."
 

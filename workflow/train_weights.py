@@ -63,7 +63,7 @@ def load_recipe(path: Path) -> dict[str, Any]:
 
 
 def make_sessions(recipe: dict[str, Any], names: set[str], jobs: int) -> None:
-    """Write the virtual sessions that are asked for and not there yet."""
+    """Write the simulated sessions that are asked for and not there yet."""
     from rol_sim.session.settings import parse_settings
     from rol_sim.session.writer import write_session
 
@@ -121,7 +121,7 @@ def open_real() -> tuple[list[Any], Any] | None:
 
     root = rall.find_real_root()
     if root is None or not (root / rall.SCANS_PATH).is_dir():
-        say("no real scans at hand: the network is judged on virtual places alone")
+        say("no real scans at hand: the network is judged on simulated places alone")
         return None
     return rall.load_scans(root), cKDTree(rall.load_map_points(root / rall.MAP_PATH))
 
@@ -131,14 +131,15 @@ def judge(
 ) -> pd.DataFrame:
     """Judge a network on every set but the one it learnt from, and on the real scans against the real map."""
     from rol.bev import image_to_points
+    from rol.pix2pix import TrainedNetwork
     from rol.training import score_points
-    from rol_beyond.front_ends import MIN_RANGE_M, Translator, judge_on_map, translate_scan
+    from rol_beyond.front_ends import MIN_RANGE_M, judge_on_map, translate_scan
 
     tables = [
         score_points(generator, pairs, LEVELS, thin=thin).assign(places=name)
         for name, pairs in sets.items() if not name.startswith("learn")
     ]  # fmt: skip
-    rows, translator = [], Translator(generator, {}, settings, {})
+    rows, translator = [], TrainedNetwork(generator, {}, settings, {})
     for scan in [] if real is None else real[0]:
         _, _, fake = translate_scan(translator, scan.codes, scan.azimuths, scan.twist)
         for level in LEVELS:
@@ -155,7 +156,7 @@ def judge(
 
 
 def choose_threshold(judged: pd.DataFrame, reach: float | None) -> int:
-    """Choose the highest level at which so large a share of the real points of the virtual places is still reached."""
+    """Choose the highest level at which so large a share of the real points of the simulated places is still reached."""
     if reach is None:
         return 128
     reached = judged[judged.places != "real"].groupby("threshold").real_to_fake_within_1m.mean()

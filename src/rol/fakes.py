@@ -86,15 +86,13 @@ def translate_session(
     ValueError
         If the weights or a radar image cannot be used; the message names the file.
     """
-    from rol_beyond.front_ends import load_translator
-
     from .pairs import list_pairs
-    from .pix2pix import choose_bf16
+    from .pix2pix import choose_bf16, load_network
 
     stamps_us = list_pairs(pairs)
     described = _read_settings(Path(pairs) / "pairs.json")
-    translator = load_translator(weights)
-    points = translator.points | ({"threshold": threshold} if threshold else {})
+    network = load_network(weights)
+    points = network.points | ({"threshold": threshold} if threshold else {})
     checksum = hashlib.sha256(Path(weights).read_bytes()).hexdigest()
     settings = {"weights": checksum, "bf16": bf16, "pairs": described}
     whole = Path(folder) / "fake.json"
@@ -102,7 +100,7 @@ def translate_session(
         yield from stamps_us
         return
     there, fast = prepare_fakes(folder, settings), choose_bf16(bf16, device)
-    generator = translator.generator.to(device)
+    generator = network.generator.to(device)
     for stamp in stamps_us:
         yield from [stamp] if stamp in there else write_fakes(generator, pairs, folder, [stamp], bf16=fast)
     finish_fakes(folder, settings, stamps_us, points)

@@ -774,8 +774,8 @@ def open_session(path: Path | str) -> Session:
     Parameters
     ----------
     path : path
-        Folder that holds `radar/` and `radar.timestamps`; lidars may be missing. A virtual session (its name
-        begins with `virtual-`) must hold the `session.json` that its maker writes last.
+        Folder that holds `radar/` and `radar.timestamps`; lidars may be missing. A simulated session (its name
+        begins with `sim-`) must hold the `session.json` that its maker writes last.
 
     Returns
     -------
@@ -788,7 +788,7 @@ def open_session(path: Path | str) -> Session:
         If there is no such session or it is incomplete; the message lists the sessions beside it.
     """
     root = Path(os.path.abspath(path))
-    files = ["radar.timestamps"] + (["session.json"] if root.name.startswith("virtual-") else [])
+    files = ["radar.timestamps"] + (["session.json"] if root.name.startswith("sim-") else [])
     missing = [] if (root / "radar").is_dir() else ["radar"]
     missing += [name for name in files if not (root / name).is_file()]
     if missing:

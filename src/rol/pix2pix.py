@@ -646,6 +646,58 @@ def load_weights(
     return generator.eval()
 
 
+@dataclass(frozen=True)
+class TrainedNetwork:
+    """A generator with what is needed to turn a scan into points.
+
+    Attributes
+    ----------
+    generator : Generator
+        The network.
+    points : dict
+        How the generated image becomes points: ``threshold`` and ``thin`` of `rol.bev.image_to_points`.
+    settings : dict
+        How the radar images were made that it was trained on.
+    about : dict
+        Header of its file.
+    """
+
+    generator: ResnetGenerator | UnetGenerator
+    points: dict[str, Any]
+    settings: dict[str, Any]
+    about: dict[str, Any]
+
+
+def load_network(path: str | Path) -> TrainedNetwork:
+    """Read a generator with its threshold and the settings of its radar images.
+
+    Parameters
+    ----------
+    path : path
+        File of `save_weights`; its header may hold ``points`` (threshold 128, no thinning otherwise) and
+        ``pairs_settings`` (the defaults of pairs otherwise).
+
+    Returns
+    -------
+    network : TrainedNetwork
+        Ready for `generate`.
+
+    Raises
+    ------
+    Pix2PixError
+        As `load_weights`, or if ``points`` or ``pairs_settings`` of the header hold anything else.
+    """
+    about, defaults = load_metadata(path), {"threshold": 128, "thin": False}
+    for name in ("points", "pairs_settings"):
+        if not isinstance(about.get(name, {}), dict):
+            raise Pix2PixError(f"{path}: header: {name} is {about[name]!r:.60}, not a JSON object")
+    points = {**defaults, **about.get("points", {})}
+    for name, value in points.items():
+        if type(value) is not type(defaults.get(name)):
+            raise Pix2PixError(f"{path}: header: points: {name} is {value!r:.60}, known are {defaults}")
+    return TrainedNetwork(load_weights(path), points, dict(about.get("pairs_settings", {})), about)
+
+
 def load_metadata(path: str | Path) -> dict[str, Any]:
     """Read the header of a weights file: architecture, sizes, seed, settings, versions.
 

@@ -1,6 +1,6 @@
 """Adapt a translator to a real radar with a few pairs of a scan and a lidar sweep. Not in the paper.
 
-A network that learnt from virtual scans alone trusts what a real radar makes up in its own way. A handful of real
+A network that learnt from simulated scans alone trusts what a real radar makes up in its own way. A handful of real
 pairs tells it better, even from another radar and a lidar that sees little: beyond the lidar's reach the network
 is held to what it drew before, so that it forgets nothing there.
 """

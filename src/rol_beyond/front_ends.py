@@ -7,8 +7,6 @@ get the same scan and the same motion, so that what they find can be compared.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -16,8 +14,7 @@ import numpy as np
 if TYPE_CHECKING:
     from scipy.spatial import cKDTree
 
-    from rol.pix2pix import ResnetGenerator
-    from rol_beyond.unet import UnetGenerator
+    from rol.pix2pix import TrainedNetwork
 
 DETECTORS = ("k-strongest", "cfar")
 MIN_RANGE_M = 2.5  # nearer than this the radar sees its own leakage [m]
@@ -25,63 +22,8 @@ MAX_RANGE_M = 64.0  # the images end there [m]
 K_STRONGEST, MIN_CODE = 12, 70  # peaks per azimuth, and the weakest code that counts, 35 dB
 
 
-@dataclass(frozen=True)
-class Translator:
-    """A trained network with all that it needs to turn a scan into points.
-
-    Attributes
-    ----------
-    generator : ResnetGenerator or UnetGenerator
-        The network.
-    points : dict
-        How the fake image becomes points: ``threshold`` and ``thin`` of `rol.bev.image_to_points`.
-    settings : dict
-        How the radar images that it learnt from were made, for `rol_beyond.scan_pairs.turned_radar_image`.
-    about : dict
-        The header of its file.
-    """
-
-    generator: ResnetGenerator | UnetGenerator
-    points: dict[str, Any]
-    settings: dict[str, Any]
-    about: dict[str, Any]
-
-
-def load_translator(path: str | Path) -> Translator:
-    """Read a network with its threshold and the settings of its images.
-
-    Parameters
-    ----------
-    path : path
-        File of `rol.pix2pix.save_weights`; its header may hold ``points`` (threshold 128, strokes as thick as
-        they are, if not) and ``pairs_settings`` (those of plain pairs if not).
-
-    Returns
-    -------
-    translator : Translator
-        Ready for `translate_scan`.
-
-    Raises
-    ------
-    rol.pix2pix.Pix2PixError
-        If the file is missing, not whole, of another architecture, or its header has other ``points`` or
-        ``pairs_settings`` than these.
-    """
-    from rol.pix2pix import Pix2PixError, load_metadata, load_weights
-
-    about, defaults = load_metadata(path), {"threshold": 128, "thin": False}
-    for name in ("points", "pairs_settings"):
-        if not isinstance(about.get(name, {}), dict):
-            raise Pix2PixError(f"{path}: header: {name} is {about[name]!r:.60}, not a JSON object")
-    points = {**defaults, **about.get("points", {})}
-    for name, value in points.items():
-        if type(value) is not type(defaults.get(name)):
-            raise Pix2PixError(f"{path}: header: points: {name} is {value!r:.60}, known are {defaults}")
-    return Translator(load_weights(path), points, dict(about.get("pairs_settings", {})), about)
-
-
 def translate_scan(
-    translator: Translator,
+    network: TrainedNetwork,
     codes: np.ndarray,
     azimuths: np.ndarray,
     twist: Sequence[float] | None = None,
@@ -96,14 +38,14 @@ def translate_scan(
 
     Parameters
     ----------
-    translator : Translator
+    network : TrainedNetwork
         The network.
     codes, azimuths : array, shape (a, b) and (a,)
         Power codes, and counter-clockwise bearings of the rows [rad].
     twist : sequence of float, optional
         Body velocity (vx, vy, yaw rate) [m/s, m/s, rad/s]; without it motion is not corrected.
     points : dict, optional
-        ``threshold`` and ``thin`` where they differ from the translator's own.
+        ``threshold`` and ``thin`` where they differ from the network's own.
     min_range_m : float
         Points nearer than this are dropped [m].
     bf16 : bool
@@ -111,7 +53,7 @@ def translate_scan(
     headings : int, optional
         Quarter turns to average, see `rol.pix2pix.generate`; the network's own number if not given.
     **changes
-        Settings of the image that differ from the translator's, such as ``range_resolution`` of another radar.
+        Settings of the image that differ from the network's, such as ``range_resolution`` of another radar.
 
     Returns
     -------
@@ -128,10 +70,10 @@ def translate_scan(
     from rol.pix2pix import generate
     from rol_beyond.scan_pairs import turned_radar_image
 
-    settings = {**translator.settings, **changes, "motion": "none" if twist is None else "corrected"}
+    settings = {**network.settings, **changes, "motion": "none" if twist is None else "corrected"}
     radar = turned_radar_image(codes, azimuths, 0.0, twist or (0.0, 0.0, 0.0), settings)
-    fake = generate(translator.generator, radar, bf16=bf16, headings=headings)
-    how = {**translator.points, **(points or {}), "min_range": min_range_m}
+    fake = generate(network.generator, radar, bf16=bf16, headings=headings)
+    how = {**network.points, **(points or {}), "min_range": min_range_m}
     size = {name: settings[name] for name in ("pixel_size", "max_range") if name in settings}
     return image_to_points(fake, **how, **size), radar, fake
 

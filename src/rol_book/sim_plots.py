@@ -1,4 +1,4 @@
-"""Figures that set virtual scans beside real ones. Nothing here computes a result; see `rol_book.plots` for the rest."""
+"""Figures that set simulated scans beside real ones. Nothing here computes a result; see `rol_book.plots` for the rest."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def draw_doppler(ax: Axes, found: Mapping[str, dict]) -> Axes:
 
 
 def draw_give_aways(axes: Sequence[Axes], found: Mapping[str, Mapping[str, float]]) -> Sequence[Axes]:
-    """Draw by which patches a classifier tells virtual from real scans.
+    """Draw by which patches a classifier tells simulated from real scans.
 
     Parameters
     ----------

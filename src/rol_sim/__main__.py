@@ -22,9 +22,9 @@ def main(arguments: list[str] | None = None) -> int:
         0 if all went well, 1 after a fault, which is told on stderr.
     """
     parser = argparse.ArgumentParser(
-        prog="python -m rol_sim", description="Write virtual sessions in Oxford's files."
+        prog="python -m rol_sim", description="Write simulated sessions in Oxford's files."
     )
-    parser.add_argument("config", help="config file (YAML) with a section 'virtual'")
+    parser.add_argument("config", help="config file (YAML) with a section 'simulated'")
     parser.add_argument(
         "--session", action="append", help="session to write; may be repeated; all of them if not given"
     )

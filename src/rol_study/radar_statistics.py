@@ -1,7 +1,7 @@
-"""Statistics of radar scans, real or virtual: how bright, how noisy, how sharp, how regular they are.
+"""Statistics of radar scans, real or simulated: how bright, how noisy, how sharp, how regular they are.
 
 Every function takes the power codes of one scan, shape (400, 3768), or of several, shape (n, 400, 3768), and
-pools what it finds. The same numbers from real and from virtual scans, side by side, tell how near the
+pools what it finds. The same numbers from real and from simulated scans, side by side, tell how near the
 simulator has come. Rows are azimuths and neighbours in time (the turn is not closed); columns are range bins.
 """
 

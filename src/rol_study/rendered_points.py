@@ -1,7 +1,7 @@
-"""Clouds for the real route: the virtual radar at the true poses of a real session, through a translator.
+"""Clouds for the real route: the simulated radar at the true poses of a real session, through a network.
 
 The public data hold map, poses and odometry of the paper's sessions, but no scans. Here the scans are made: the world is
-grown from the real map, the virtual car drives through the real poses, and what its radar sees goes through the network.
+grown from the real map, the simulated car drives through the real poses, and what its radar sees goes through the network.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ import numpy as np
 from rol.geometry import relative_pose
 
 if TYPE_CHECKING:
-    from rol_beyond.front_ends import Translator
-    from rol_sim.session.assembly import VirtualSession
+    from rol.pix2pix import TrainedNetwork
+    from rol_sim.session.assembly import SimulatedSession
 
 STREET = {"parked_share": 0.15, "vehicles": 10, "people": 6}  # as for the twins of the real scans
 
@@ -27,7 +27,7 @@ def render_clouds(
     number: str,
     first_scan: int,
     n_scans: int,
-    translator: Translator,
+    network: TrainedNetwork,
     seed: int,
     *,
     bf16: bool = False,
@@ -36,7 +36,7 @@ def render_clouds(
 ) -> Iterator[np.ndarray]:
     """Give the fake lidar points of a stretch of a real session, scan by scan, as its radar might have led to them.
 
-    Real are the map and the poses, and with them the speed and the stops. Virtual are the radar, the heights and materials
+    Real are the map and the poses, and with them the speed and the stops. Simulated are the radar, the heights and materials
     of the world, what the map does not show or shows no more, and who is met.
 
     Parameters
@@ -47,10 +47,10 @@ def render_clouds(
         Of the session, such as "02".
     first_scan, n_scans : int
         Where in ``pose_xy_<number>.txt`` the stretch begins, and how many scans it has: at least 3, or 0 for all that follow.
-    translator : Translator
-        From `rol_beyond.front_ends.load_translator`; threshold and thinning are its own.
+    network : TrainedNetwork
+        From `rol.pix2pix.load_network`; threshold and thinning are its own.
     seed : int
-        Draws all that is virtual: the same seed, the same world for all sessions, each on a day of its own.
+        Draws all that is simulated: the same seed, the same world for all sessions, each on a day of its own.
     bf16, headings
         Of `rol_beyond.front_ends.translate_scan`: multiply in bfloat16; quarter turns to average, the network's own number if not
         given.
@@ -82,24 +82,24 @@ def render_clouds(
     surroundings of the eleven real scans and of one more place (``sets`` in its card). Clouds from there flatter it.
     """
     session = build_stretch(real_root, number, first_scan, n_scans, seed, **changes)
-    return _translate(session, translator, bf16=bf16, headings=headings)
+    return _translate(session, network, bf16=bf16, headings=headings)
 
 
 def build_stretch(
     real_root: Path | str, number: str, first_scan: int, n_scans: int, seed: int, **changes: Any
-) -> VirtualSession:
+) -> SimulatedSession:
     """Prepare the drive along a stretch of a real session, see `render_clouds`.
 
     Returns
     -------
-    session : VirtualSession
+    session : SimulatedSession
         Ready for `make_scan`. It has no sweeps.
     """
     from rol_data import rall
     from rol_sim.session.assembly import build_session
     from rol_sim.session.settings import parse_settings
 
-    name, path = f"virtual-rendered-{number}", Path(real_root) / rall.POSES_PATH / f"pose_xy_{number}.txt"
+    name, path = f"sim-rendered-{number}", Path(real_root) / rall.POSES_PATH / f"pose_xy_{number}.txt"
     own = {
         "start": "2019-01-10T12:00:00", "seed": zlib.crc32(str(number).encode()), "sweeps": "none", **STREET, **changes,
         "poses": number, "first_scan": int(first_scan), "scans": int(n_scans),
@@ -108,21 +108,21 @@ def build_stretch(
     return build_session(parse_settings(section, str(path)), name)
 
 
-def _translate(session: VirtualSession, translator: Translator, **how: Any) -> Iterator[np.ndarray]:
+def _translate(session: SimulatedSession, network: TrainedNetwork, **how: Any) -> Iterator[np.ndarray]:
     from rol_beyond.front_ends import translate_scan
     from rol_sim.session.assembly import make_scan
 
     for index, twist in enumerate(true_twists(session)):
         scan = make_scan(session, index)
-        yield translate_scan(translator, scan.codes, scan.azimuths, tuple(twist), **how)[0]
+        yield translate_scan(network, scan.codes, scan.azimuths, tuple(twist), **how)[0]
 
 
-def true_twists(session: VirtualSession) -> np.ndarray:
+def true_twists(session: SimulatedSession) -> np.ndarray:
     """Give the body velocity at every scan from the true poses, as `rol.pairs.estimate_twists` does from an odometry.
 
     Parameters
     ----------
-    session : VirtualSession
+    session : SimulatedSession
         The session.
 
     Returns

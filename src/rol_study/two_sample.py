@@ -1,6 +1,6 @@
 """The hard test of a simulator: can a classifier tell its scans from real ones?
 
-A small convolutional network looks at patches of 16 azimuths x 64 range bins and says "real" or "virtual". It
+A small convolutional network looks at patches of 16 azimuths x 64 range bins and says "real" or "simulated". It
 learns on some scans and is judged on others. An area under the curve of 0.5 means that it cannot tell, 1 that
 it always can. `give_aways` says where it can.
 """
@@ -26,7 +26,7 @@ class Verdict:
     fold_aucs : array, shape (folds,)
         The same for each group of scans left out.
     scores : array, shape (2, n, 25, 58)
-        Score of each patch ("real" is high), of real and of virtual scans, by scan, azimuth and range.
+        Score of each patch ("real" is high), of real and of simulated scans, by scan, azimuth and range.
     """
 
     auc: float
@@ -52,12 +52,12 @@ def cut_patches(codes: np.ndarray) -> np.ndarray:
     return np.ascontiguousarray(cut.transpose(0, 1, 3, 2, 4))
 
 
-def area_under_curve(real: np.ndarray, virtual: np.ndarray) -> float:
-    """Give the chance that a real patch scores higher than a virtual one; ties count half.
+def area_under_curve(real: np.ndarray, simulated: np.ndarray) -> float:
+    """Give the chance that a real patch scores higher than a simulated one; ties count half.
 
     Parameters
     ----------
-    real, virtual : array, any shape
+    real, simulated : array, any shape
         Scores.
 
     Returns
@@ -67,14 +67,14 @@ def area_under_curve(real: np.ndarray, virtual: np.ndarray) -> float:
     """
     from scipy.stats import rankdata
 
-    real, virtual = np.ravel(real), np.ravel(virtual)
-    ranks = rankdata(np.concatenate([real, virtual]))[: len(real)]
-    return float((ranks.sum() - 0.5 * len(real) * (len(real) + 1)) / (len(real) * len(virtual)))
+    real, simulated = np.ravel(real), np.ravel(simulated)
+    ranks = rankdata(np.concatenate([real, simulated]))[: len(real)]
+    return float((ranks.sum() - 0.5 * len(real) * (len(real) + 1)) / (len(real) * len(simulated)))
 
 
 def tell_apart(
     real: np.ndarray,
-    virtual: np.ndarray,
+    simulated: np.ndarray,
     rng: np.random.Generator,
     *,
     folds: int = 3,
@@ -85,7 +85,7 @@ def tell_apart(
 
     Parameters
     ----------
-    real, virtual : array, shape (n, 400, 3768), uint8
+    real, simulated : array, shape (n, 400, 3768), uint8
         Scans; scan i of the one and scan i of the other are always on the same side of the split, so that a
         place that both show helps neither.
     rng : numpy.random.Generator
@@ -104,11 +104,13 @@ def tell_apart(
     Raises
     ------
     ValueError
-        If there are not as many real as virtual scans, or fewer scans than groups.
+        If there are not as many real as simulated scans, or fewer scans than groups.
     """
-    if len(real) != len(virtual) or not 2 <= folds <= len(real):
-        raise ValueError(f"{len(real)} real and {len(virtual)} virtual scans cannot be split into {folds}")
-    patches = np.stack([cut_patches(real), cut_patches(virtual)])
+    if len(real) != len(simulated) or not 2 <= folds <= len(real):
+        raise ValueError(
+            f"{len(real)} real and {len(simulated)} simulated scans cannot be split into {folds}"
+        )
+    patches = np.stack([cut_patches(real), cut_patches(simulated)])
     scores, aucs = np.empty(patches.shape[:4]), []
     for left_out in np.array_split(np.arange(len(real)), folds):
         learnt = np.setdiff1d(np.arange(len(real)), left_out)
@@ -118,14 +120,14 @@ def tell_apart(
     return Verdict(area_under_curve(*scores), np.array(aucs), scores)
 
 
-def give_aways(verdict: Verdict, real: np.ndarray, virtual: np.ndarray) -> dict[str, dict[str, float]]:
+def give_aways(verdict: Verdict, real: np.ndarray, simulated: np.ndarray) -> dict[str, dict[str, float]]:
     """Say by what patches the classifier tells the two apart.
 
     Parameters
     ----------
     verdict : Verdict
         From `tell_apart`.
-    real, virtual : array, shape (n, 400, 3768), uint8
+    real, simulated : array, shape (n, 400, 3768), uint8
         The scans that it was made from.
 
     Returns
@@ -136,7 +138,7 @@ def give_aways(verdict: Verdict, real: np.ndarray, virtual: np.ndarray) -> dict[
     """
     from rol_study.radar_statistics import MEASURED_RANGE_RESOLUTION
 
-    peaks = np.stack([cut_patches(real), cut_patches(virtual)]).max(axis=(-1, -2))
+    peaks = np.stack([cut_patches(real), cut_patches(simulated)]).max(axis=(-1, -2))
     range_m = np.broadcast_to(
         (np.arange(peaks.shape[3]) + 0.5) * BINS * MEASURED_RANGE_RESOLUTION, peaks.shape
     )

@@ -84,10 +84,10 @@ def test_every_image_exists_and_has_alt_text(html: Path) -> None:
     assert not faults
 
 
-def test_every_caption_says_virtual_or_real(profile: dict, html: Path) -> None:
+def test_every_caption_says_simulated_or_real(profile: dict, html: Path) -> None:
     for page in book_pages(profile):
         for caption in read_page(html / "notebooks" / f"{page}.html").select("figcaption .caption-text"):
-            assert re.search("virtual|real", caption.get_text(), re.IGNORECASE), (
+            assert re.search("simulated|real", caption.get_text(), re.IGNORECASE), (
                 f"{page}: {caption.get_text()}"
             )
 

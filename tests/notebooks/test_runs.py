@@ -2,6 +2,7 @@
 
 import json
 import os
+import shlex
 import subprocess
 import sys
 from pathlib import Path
@@ -98,11 +99,10 @@ def test_one_session_runs_again_alone_with_the_same_numbers(profile: dict, tmp_p
     """The README's command for one chapter and one session; same seed, same numbers."""
     run = next(run for run in all_runs(profile) if run.chapter == "07_localization")
     parameters = run_parameters(profile, run) | {"out_dir": str(tmp_path / "again")}
-    command = f"{sys.executable} -m papermill notebooks/07_localization.ipynb {tmp_path}/07.ipynb --no-progress-bar "
-    command += "--kernel python3 " + papermill_arguments(parameters)
-    answer = subprocess.run(
-        command, shell=True, cwd=ROOT, capture_output=True, text=True, check=False, env=environment()
-    )
+    notebooks = ["notebooks/07_localization.ipynb", str(tmp_path / "07.ipynb")]
+    command = [sys.executable, "-m", "papermill", *notebooks, "--no-progress-bar", "--kernel", "python3"]
+    command += shlex.split(papermill_arguments(parameters))
+    answer = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False, env=environment())
     assert answer.returncode == 0, answer.stderr[-3000:]
     folder = Path("localization", run.session, run.method)
     first = check_localization(Path(profile["out_dir"]) / folder, run.session, run.method)

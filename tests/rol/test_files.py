@@ -104,7 +104,7 @@ def test_other_encodings_are_named(tmp_path: Path) -> None:
         ),
         ("1 2 3\n", lambda path: rall.load_poses(path).tolist()),
         ("timestamp_us,x_m,y_m,yaw_rad\n1,0,0,0\n", lambda path: list(rall.load_scan_poses(path))),
-        ("virtual: {sessions: {virtual-a: {start: 2019-01-10T11:46:21, scans: 3}}}\n", load_settings),
+        ("simulated: {sessions: {sim-a: {start: 2019-01-10T11:46:21, scans: 3}}}\n", load_settings),
         (json.dumps(METRICS), evaluation.read_metrics),
         ((ROOT / "config" / "demo.yaml").read_text(encoding="utf-8"), chapters.load_config),
     ],

@@ -61,7 +61,7 @@ def test_each_lidar_alone_is_read_with_its_own_mounting(left_only: oxford.Sessio
 def test_chapter_1_draws_a_sweep_without_firings(left_only: oxford.Session, tmp_path: Path) -> None:
     nbformat, papermill = pytest.importorskip("nbformat"), pytest.importorskip("papermill")
     notebook = nbformat.read(ROOT / "notebooks" / "01_sessions.ipynb", as_version=4)
-    [end] = [i for i, cell in enumerate(notebook.cells) if "## How a virtual session" in cell.source]
+    [end] = [i for i, cell in enumerate(notebook.cells) if "## How a simulated session" in cell.source]
     notebook.cells = notebook.cells[:end]
     nbformat.write(notebook, tmp_path / "in.ipynb")
     places = {"sessions_root": str(left_only.root.parent), "sessions": [left_only.name]}

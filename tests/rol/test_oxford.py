@@ -645,14 +645,14 @@ def test_unknown_session_lists_those_that_are_there(session_root):
 
 
 def test_incomplete_sessions_are_refused(session_root):
-    virtual = session_root.parent / "virtual-town-train"
-    shutil.copytree(session_root, virtual)
-    with pytest.raises(OxfordError, match="virtual-town-train: incomplete session, session.json missing"):
-        oxford.open_session(virtual)
-    (virtual / "session.json").write_text("{}", encoding="utf-8")
-    assert oxford.open_session(virtual).name == "virtual-town-train"
+    simulated = session_root.parent / "sim-town-train"
+    shutil.copytree(session_root, simulated)
+    with pytest.raises(OxfordError, match="sim-town-train: incomplete session, session.json missing"):
+        oxford.open_session(simulated)
+    (simulated / "session.json").write_text("{}", encoding="utf-8")
+    assert oxford.open_session(simulated).name == "sim-town-train"
     (session_root / "radar.timestamps").unlink()
-    with pytest.raises(OxfordError, match="radar.timestamps missing; sessions beside it: virtual-town-train"):
+    with pytest.raises(OxfordError, match="radar.timestamps missing; sessions beside it: sim-town-train"):
         oxford.open_session(session_root)
 
 

@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial import cKDTree
 
 from rol_beyond import front_ends
-from rol_beyond.front_ends import Translator, detect_points, even_out, judge_on_map
+from rol_beyond.front_ends import detect_points, even_out, judge_on_map
 
 AZIMUTHS = -2.0 * np.pi * (13 + 14 * np.arange(400)) / 5600
 
@@ -78,13 +78,13 @@ def test_shares_on_a_map_by_hand() -> None:
 @pytest.mark.torch
 def test_translated_scan_stands_where_the_scan_shows_it(tmp_path: Path) -> None:
     torch = pytest.importorskip("torch")
-    from rol.pix2pix import build_generator, save_weights
+    from rol.pix2pix import TrainedNetwork, build_generator, load_network, save_weights
 
     generator = build_generator(2, 1, rng=torch.Generator().manual_seed(1))
     generator.image_size = (512, 512)
     path = tmp_path / "net.safetensors"
     save_weights(path, generator, {"points": {"threshold": 140}, "pairs_settings": {"motion": "corrected"}})
-    read = front_ends.load_translator(path)
+    read = load_network(path)
     assert read.points == {"threshold": 140, "thin": False} and read.settings == {"motion": "corrected"}
     assert read.about["filters"] == 2
 
@@ -100,7 +100,7 @@ def test_translated_scan_stands_where_the_scan_shows_it(tmp_path: Path) -> None:
         def logits(self, radar: torch.Tensor) -> torch.Tensor:
             return torch.atanh(radar * 0.999)
 
-    codes, copy = scan_with_spot(0.8, 30.0, 255), Translator(Copy(), {"threshold": 60}, {}, {})
+    codes, copy = scan_with_spot(0.8, 30.0, 255), TrainedNetwork(Copy(), {"threshold": 60}, {}, {})
     points, radar_image, fake_image = front_ends.translate_scan(copy, codes, AZIMUTHS)
     assert np.abs(radar_image.astype(int) - fake_image).max() <= 1
     np.testing.assert_array_equal(front_ends.translate_scan(copy, codes, AZIMUTHS, headings=4)[2], fake_image)
@@ -136,8 +136,8 @@ def test_even_out_lets_a_front_count_by_its_length():
 )
 def test_header_with_other_points_is_refused(tmp_path: Path, header: dict, fault: str) -> None:
     torch = pytest.importorskip("torch")
-    from rol.pix2pix import Pix2PixError, build_generator, save_weights
+    from rol.pix2pix import Pix2PixError, build_generator, load_network, save_weights
 
     save_weights(tmp_path / "net.safetensors", build_generator(2, 1, rng=torch.Generator()), header)
     with pytest.raises(Pix2PixError, match=f"net.safetensors: header: {fault}"):
-        front_ends.load_translator(tmp_path / "net.safetensors")
+        load_network(tmp_path / "net.safetensors")

@@ -90,7 +90,7 @@ def make_pairs(tmp_path: Path) -> ScanPairs:
             np.full(400, 255, np.uint8), bright_spot(-0.5, 20.0),
         ),
     )  # fmt: skip
-    session = SimpleNamespace(name="virtual-x", radar_path=lambda us: tmp_path / f"{us}.png")
+    session = SimpleNamespace(name="sim-x", radar_path=lambda us: tmp_path / f"{us}.png")
     jobs = [
         {"radar_stamp": 1000, "left_stamp": 1, "right_stamp": 2, "mid_stamp_us": 3, "twist": (5.0, 0.0, 0.1)}
     ]

@@ -10,7 +10,8 @@ from scipy.spatial import cKDTree
 pytest.importorskip("torch")
 from safetensors import safe_open
 
-from rol_beyond.front_ends import detect_points, judge_on_map, load_translator, translate_scan
+from rol.pix2pix import load_network
+from rol_beyond.front_ends import detect_points, judge_on_map, translate_scan
 from rol_data import rall
 
 pytestmark = pytest.mark.torch
@@ -22,7 +23,7 @@ def test_weights_are_small_and_have_a_card_that_fits(path: Path) -> None:
     assert path.stat().st_size < 25e6
     card, translator = (
         json.loads(path.with_suffix(".json").read_text(encoding="utf-8")),
-        load_translator(path),
+        load_network(path),
     )
     assert translator.about["card"] == path.with_suffix(".json").name and card["name"] == path.stem
     assert translator.points == {"threshold": card["threshold"], "thin": card["thin"]}
@@ -43,7 +44,7 @@ def test_the_networks_that_chapters_use_are_there() -> None:
 
 def test_the_best_network_beats_raw_peaks_on_real_scans_as_its_card_says(real_root: Path) -> None:
     path = next(path for path in WEIGHTS if path.stem == "rol")
-    translator, tree = load_translator(path), cKDTree(rall.load_map_points(real_root / rall.MAP_PATH))
+    translator, tree = load_network(path), cKDTree(rall.load_map_points(real_root / rall.MAP_PATH))
     rows = []
     for scan in rall.load_scans(real_root)[::3]:
         fake = translate_scan(translator, scan.codes, scan.azimuths, scan.twist)[0]

@@ -17,7 +17,7 @@ from rol.pix2pix import Pix2PixError, TrainConfig
 from rol_beyond.motion import MotionModel
 from rol_beyond.recovery import RecoverySettings
 from rol_sim.sensors.radar import RadarSettings
-from rol_sim.session.settings import SessionSettings, SettingsError, VirtualSettings
+from rol_sim.session.settings import SessionSettings, SettingsError, SimulationSettings
 from rol_study.sampled_points import FrontEnd, MapPointsError
 
 NEEDED = {
@@ -64,7 +64,7 @@ def test_the_classes_are_all_there() -> None:
     names = {kind.__name__ for kind in settings_classes()}
     assert names == {
         "FailureRule", "FrontEnd", "LidarSettings", "LocalMapSettings", "MclSettings", "MotionModel",
-        "RadarSettings", "RecoverySettings", "SessionSettings", "Surface", "TrainConfig", "VirtualSettings",
+        "RadarSettings", "RecoverySettings", "SessionSettings", "Surface", "TrainConfig", "SimulationSettings",
     }  # fmt: skip
 
 
@@ -99,7 +99,7 @@ def test_the_classes_are_all_there() -> None:
         (TrainConfig, {"pixel_loss": "l2"}, Pix2PixError, "pixel_loss: 'l2' is none of l1, entropy"),
         (FrontEnd, {"share_1m": 40.0}, MapPointsError, "share_1m: 40.0 is not in"),
         (RadarSettings, {"layer_widths_deg": (0.8, 0.0)}, ValueError, "layer_widths_deg: .* is not in"),
-        (VirtualSettings, {"loop_m": 10.0}, SettingsError, r"loop_m: 10.0 is not in \[450, inf\)"),
+        (SimulationSettings, {"loop_m": 10.0}, SettingsError, r"loop_m: 10.0 is not in \[450, inf\)"),
         (SessionSettings, {"changed_share": 0.4}, SettingsError, r"changed_share: 0.4 is not in \[0, 0.3\]"),
         (SessionSettings, {"start": "noon"}, SettingsError, "start: 'noon' is not a date and time"),
     ],

@@ -21,10 +21,10 @@ pairs: {motion: corrected, width: 64, pixel_size: 1.0, max_range: 32.0}
 worlds:
   - seed: 3
     sessions:
-      virtual-x: {start: "2019-01-10T11:46:21", scans: 7, seed: 2, stops: 0, stand_s: 0, vehicles: 4, people: 2}
+      sim-x: {start: "2019-01-10T11:46:21", scans: 7, seed: 2, stops: 0, stand_s: 0, vehicles: 4, people: 2}
 sets:
-  learn: [{session: virtual-x, every: 2}]
-  rest: [{session: virtual-x, every: 3}]
+  learn: [{session: sim-x, every: 2}]
+  rest: [{session: sim-x, every: 3}]
 networks:
   tiny: {network: unet, filters: 4, blocks: 1, gan_weight: 0, pixel_loss: entropy, lambda_l1: 1, rotate: true,
          gain_spread_db: 2.0, streaks: 1.0, reach: 0.7, thin: true, steps: 6, batch: 2, report_every: 2, checkpoint_every: 2}
@@ -116,10 +116,10 @@ def test_threshold_is_the_highest_that_still_reaches() -> None:
 
 def test_places_choose_scans_and_waiting_ones_are_left_out(recipe: Path) -> None:
     given = train_weights.load_recipe(recipe)
-    train_weights.make_sessions(given, {"virtual-x"}, 1)
-    root, part = Path(given["sessions_root"]), {"session": "virtual-x"}
+    train_weights.make_sessions(given, {"sim-x"}, 1)
+    root, part = Path(given["sessions_root"]), {"session": "sim-x"}
     _, every = train_weights.choose_jobs(root, part, "corrected")
-    truth = np.loadtxt(root / "virtual-x" / "truth.tum")
+    truth = np.loadtxt(root / "sim-x" / "truth.tum")
     place = truth[1, 1:3].tolist()
     _, near = train_weights.choose_jobs(root, {**part, "within": [[*place, 1.0]]}, "corrected")
     _, far = train_weights.choose_jobs(root, {**part, "without": [[*place, 1.0]]}, "corrected")
@@ -143,7 +143,5 @@ def test_recipes_that_lack_a_part_are_told(tmp_path: Path) -> None:
     (tmp_path / "r.yaml").write_text("seed: 1\n", encoding="utf-8")
     with pytest.raises(ValueError, match="r.yaml: the key 'ablations' is missing"):
         train_weights.load_recipe(tmp_path / "r.yaml")
-    with pytest.raises(ValueError, match="no world has a session 'virtual-y'; there are: virtual-x"):
-        train_weights.make_sessions(
-            {**yaml.safe_load(RECIPE), "sessions_root": str(tmp_path)}, {"virtual-y"}, 1
-        )
+    with pytest.raises(ValueError, match="no world has a session 'sim-y'; there are: sim-x"):
+        train_weights.make_sessions({**yaml.safe_load(RECIPE), "sessions_root": str(tmp_path)}, {"sim-y"}, 1)

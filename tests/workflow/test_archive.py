@@ -99,7 +99,7 @@ def summary() -> str:
         "book", "notebooks/08_results.ipynb", "'/a b/bin/python' stage.py && /a/bin/jupyter-book ."
     )
     session = run_of.format(
-        "virtual_session", "", "[ -e a ] || rm b; echo c > d; /a/bin/python -m e || { tail; }"
+        "simulated_session", "", "[ -e a ] || rm b; echo c > d; /a/bin/python -m e || { tail; }"
     )
     return HEADER + "".join(made) + f"{page}\t{book}{SESSION}\t{session}"
 

@@ -272,7 +272,7 @@ def test_binder_makes_a_session_of_the_demo() -> None:
     script = ROOT / "postBuild"
     assert os.access(script, os.X_OK)
     config, session, out = re.search(
-        r"rol\.virtual (\S+) --session (\S+) --out (\S+)", script.read_text(encoding="utf-8")
+        r"rol_sim (\S+) --session (\S+) --out (\S+)", script.read_text(encoding="utf-8")
     ).groups()
     demo = chapters.load_config(ROOT / config)
     assert demo["profile"] == "demo" and session == demo["sessions"][0] and out == demo["sessions_root"]

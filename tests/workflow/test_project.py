@@ -76,8 +76,8 @@ def test_profile_is_whole_and_its_knobs_are_parameters(profile: Path) -> None:
     assert config["profile"] == profile.stem
     for run in chapters.all_runs(config):
         chapters.run_parameters(config, run)
-    made = set((config["virtual"] or {}).get("sessions", {}))
-    assert made == {session for session in config["sessions"] if session.startswith("virtual-")}
+    made = set((config["simulated"] or {}).get("sessions", {}))
+    assert made == {session for session in config["sessions"] if session.startswith("sim-")}
 
 
 @pytest.mark.parametrize("chapter", CHAPTERS)
@@ -176,26 +176,110 @@ def test_code_text_leaves_out_comments_and_docstrings_only() -> None:
     assert chapters.code_text(source) == 'X = "# no comment"\ndef f():\n    return X'
 
 
-def test_imports_are_followed_through_the_package(tmp_path: Path) -> None:
-    (tmp_path / "virtual").mkdir()
+@pytest.fixture
+def packages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder with two packages, one of which imports the other, that stands for ``src``; and a lock file."""
     files = {
-        "geometry.py": "",
-        "mcl.py": "def f():\n    from .geometry import compose\n",
-        "plots.py": "",
-        "virtual/__init__.py": "",
-        "virtual/scene.py": "from ..mcl import f\nfrom . import world",
-        "virtual/world.py": "import numpy",
+        "rol/__init__.py": '"""Package."""\n\n__version__ = "1"\n',
+        "rol/geometry.py": "import numpy\n",
+        "rol/mcl.py": 'def f():\n    """Doc."""\n    from .geometry import compose\n',
+        "rol/plots.py": "",
+        "simulator/__init__.py": "",
+        "simulator/world/__init__.py": "",
+        "simulator/world/scene.py": "from rol.mcl import f\nfrom . import town\nfrom ..radar import *\n",
+        "simulator/world/town.py": "import yaml\n",
+        "simulator/radar.py": "",
     }
     for name, text in files.items():
-        (tmp_path / name).write_text(text, encoding="utf-8")
+        (tmp_path / "src" / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / "src" / name).write_text(text, encoding="utf-8")
+    (tmp_path / "requirements.lock").write_text("# versions\nnumpy==2.0\n", encoding="utf-8")
+    monkeypatch.setattr(chapters, "SOURCE", tmp_path / "src")
+    monkeypatch.setattr(chapters, "LOCK", tmp_path / "requirements.lock")
+    return tmp_path / "src"
 
-    def names(*sources: str) -> set[str]:
-        return {file.relative_to(tmp_path).as_posix() for file in chapters.module_files(sources, tmp_path)}
 
-    assert names("import numpy") == set()
-    assert names("%matplotlib inline\nfrom rol.mcl import f") == {"mcl.py", "geometry.py"}
-    assert names("from rol import plots as p") == {"plots.py"}
-    assert names("import rol_sim.world.scene") == set(files) - {"plots.py"}
+def used_files(*sources: str) -> set[str]:
+    files = chapters.module_files(sources, "n.ipynb")
+    return {file.relative_to(chapters.SOURCE).as_posix() for file in files}
+
+
+def test_imports_are_followed_through_all_packages(packages: Path) -> None:
+    mcl = {"rol/__init__.py", "rol/mcl.py", "rol/geometry.py"}
+    simulator = {file.relative_to(packages).as_posix() for file in packages.glob("simulator/**/*.py")}
+    assert used_files("import numpy") == set()
+    assert used_files("%matplotlib inline\nfrom rol.mcl import f") == mcl
+    assert used_files("from rol import plots as p") == {"rol/__init__.py", "rol/plots.py"}
+    assert used_files("from rol import __version__") == {"rol/__init__.py"}
+    assert used_files("import simulator.world.scene") == mcl | simulator
+
+
+@pytest.mark.parametrize(
+    "line", ["import rol_gone.mcl", "from rol.gone import f", "from rol import gone", "import rolled"]
+)
+def test_import_that_leads_to_no_file_is_refused(packages: Path, tmp_path: Path, line: str) -> None:
+    gone = line.removeprefix("import ").replace("from ", "").replace(" import ", ".")
+    with pytest.raises(ChapterError, match=f"n.ipynb: imports `{gone}`"):
+        chapters.chapter_digest(write_notebook(tmp_path / "n.ipynb", new_code_cell(line)))
+    (packages / "rol/plots.py").write_text(line, encoding="utf-8")
+    with pytest.raises(ChapterError, match=f"plots.py: imports `{gone}`"):
+        used_files("import rol.plots")
+
+
+def test_package_that_is_no_longer_found_is_missed(packages: Path) -> None:
+    (packages / "rol/__init__.py").unlink()
+    with pytest.raises(ChapterError, match=r"scene.py: imports `rol\.mcl\.f`"):
+        used_files("import simulator.world.scene")
+
+
+def test_every_folder_of_code_is_a_package_that_digests_follow() -> None:
+    folders = {file.parent for file in chapters.SOURCE.rglob("[!.]*.py")}
+    assert all((folder / "__init__.py").is_file() for folder in folders)
+    assert all(folder.relative_to(chapters.SOURCE).parts[0].startswith("rol") for folder in folders)
+
+
+@pytest.mark.parametrize(
+    ("file", "before", "after", "is_other"),
+    [
+        ("src/rol/geometry.py", "import numpy", "import scipy", True),
+        ("src/rol/__init__.py", '"1"', '"2"', True),
+        ("src/rol/mcl.py", '"""Doc."""', '"""Another docstring."""  # and a comment', False),
+        ("src/rol/plots.py", "", "x = 1", False),
+        ("requirements.lock", "numpy==2.0", "numpy==2.1", True),
+        ("requirements.lock", "# versions", "# pinned versions", False),
+    ],
+)
+def test_digest_follows_code_and_versions(
+    packages: Path, tmp_path: Path, file: str, before: str, after: str, is_other: bool
+) -> None:
+    path = write_notebook(tmp_path / "n.ipynb", new_code_cell("from simulator.world import scene"))
+    digests = [chapters.chapter_digest(path)]
+    text = (tmp_path / file).read_text(encoding="utf-8")
+    (tmp_path / file).write_text(text.replace(before, after, 1), encoding="utf-8")
+    digests.append(chapters.chapter_digest(path))
+    assert (digests[0] != digests[1]) == is_other
+
+
+def test_every_digest_follows_the_lock_file(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    def digests() -> list[str]:
+        return [
+            chapters.simulator_digest(),
+            chapters.script_digest("generate_images.py"),
+            chapters.stored_digest(new_notebook(), {}),
+        ]
+
+    before = digests()
+    monkeypatch.setattr(chapters, "LOCK", tmp_path / "other.lock")
+    (tmp_path / "other.lock").write_text("numpy==2.1\n", encoding="utf-8")
+    assert not set(before) & set(digests())
+
+
+def test_stored_digest_covers_every_package(packages: Path) -> None:
+    digests = {chapters.stored_digest(new_notebook(), {})}
+    for n, file in enumerate(sorted(packages.rglob("*.py")), start=2):
+        file.write_text(file.read_text(encoding="utf-8") + "x = 1\n", encoding="utf-8")
+        digests.add(chapters.stored_digest(new_notebook(), {}))
+        assert len(digests) == n
 
 
 def test_digest_of_a_chapter_follows_its_code_and_not_its_text(tmp_path: Path) -> None:
@@ -320,7 +404,7 @@ def test_network_of_chapter_04_is_trained_before_its_images_are_generated(
     config = chapters.load_config(ROOT / "config/smoke.yaml") | {"out_dir": out_dir}
     config["notebooks"]["05_real_vs_fake"] |= {"network": "chapter 04"}
     (workplace / "own.yaml").write_text(yaml.safe_dump(config), encoding="utf-8")
-    made = "build/smoke/fake/virtual-town-seq01/fake.json"
+    made = "build/smoke/fake/sim-town-seq01/fake.json"
     answer = snakemake(workplace, "-n", "--quiet", "rules", "--configfile", "own.yaml", "--", made)
     assert answer.returncode == 0, answer.stderr
     plan = dict(re.findall(r"^(\w+) +(\d+)$", answer.stdout + answer.stderr, flags=re.MULTILINE))
@@ -332,7 +416,7 @@ def test_smoke_profile_plans_every_run(workplace: Path) -> None:
     assert answer.returncode == 0, answer.stderr
     plan = dict(re.findall(r"^(\w+) +(\d+)$", answer.stdout + answer.stderr, flags=re.MULTILINE))
     assert plan == {
-        "virtual_session": "5",
+        "simulated_session": "5",
         "alignment": "5",
         "ground_removal": "5",
         "generated_images": "5",

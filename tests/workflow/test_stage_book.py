@@ -133,15 +133,13 @@ def test_binder_finds_what_the_button_needs() -> None:
 
 def test_metadata_files_of_macos_are_passed_over(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     package, pages = tmp_path / "src/rol", tmp_path / "book"
-    shutil.copytree(chapters.PACKAGE, package, ignore=shutil.ignore_patterns("__pycache__"))
+    shutil.copytree(ROOT / "src/rol", package, ignore=shutil.ignore_patterns("__pycache__"))
     shutil.copytree(ROOT / "book", pages, ignore=shutil.ignore_patterns("__pycache__"))
-    for folder, kind in itertools.product(
-        (package, package / "virtual", pages, pages / "images"), ("md", "py")
-    ):
+    for folder, kind in itertools.product((package, pages, pages / "images"), ("md", "py")):
         (folder / f"._x.{kind}").write_bytes(b"\0\5\x16\7\xff")
     monkeypatch.chdir(tmp_path)
-    for module in (chapters, toolbox_pages):
-        monkeypatch.setattr(module, "PACKAGE", package)
+    monkeypatch.setattr(chapters, "SOURCE", package.parent)
+    monkeypatch.setattr(toolbox_pages, "PACKAGE", package)
     monkeypatch.setattr(stage_book, "ROOT", tmp_path)
     for name in ("stage_notebooks", "stage_result_figure"):
         monkeypatch.setattr(stage_book, name, lambda *_: None)
@@ -182,7 +180,7 @@ def test_page_keeps_each_script_once_and_none_of_thebe(quiet_pages: ModuleType) 
 @pytest.mark.parametrize(
     ("page", "notebook"),
     [
-        ("07_localization-virtual-town-seq02", "07_localization"),
+        ("07_localization-sim-town-seq02", "07_localization"),
         ("07_localization-2019-01-10-12-32-52-radar-oxford-10k-paper", "07_localization"),
         ("03_ground_removal", "03_ground_removal"),
     ],
@@ -249,18 +247,18 @@ def write_run(path: Path, figure: str, png: bytes | None) -> SimpleNamespace:
     return SimpleNamespace(chapter=path.stem, path=lambda out_dir: path)
 
 
-@pytest.mark.parametrize(("real", "words"), [(b"real", "real.md"), (None, "virtual.md")])
+@pytest.mark.parametrize(("real", "words"), [(b"real", "real.md"), (None, "simulated.md")])
 def test_first_picture_is_real_where_it_can_be(
     book: Path, monkeypatch: pytest.MonkeyPatch, real: bytes | None, words: str
 ) -> None:
     (book / "images").mkdir()
-    for name in ("real.md", "virtual.md"):
+    for name in ("real.md", "simulated.md"):
         (book / "images" / name).write_text(name, encoding="utf-8")
-    pngs = {"10_real_radar": real, "07_localization": b"virtual"}
+    pngs = {"10_real_radar": real, "07_localization": b"simulated"}
     runs = {c: write_run(book / f"{c}.ipynb", f, pngs[c]) for c, f, _ in stage_book.RESULT_FIGURES}
     monkeypatch.setattr(stage_book, "book_pages", lambda config: runs)
     stage_book.stage_result_figure({"out_dir": ""}, book)
-    assert (book / "images" / "result.png").read_bytes() == (real or b"virtual")
+    assert (book / "images" / "result.png").read_bytes() == (real or b"simulated")
     assert (book / "picture.md").read_text(encoding="utf-8") == words
 
 
@@ -294,12 +292,12 @@ def test_chapter_opens_with_the_last_picture_that_was_drawn(tmp_path: Path) -> N
     notebook = chapter_with(
         ("fig-a", b"a", None), ("fig-b", b"b", "B"), ("fig-c", b"c", "C ({kind} data)"), ("fig-d", None, "D")
     )
-    stage_book.open_with_picture(notebook, tmp_path / "images", "05_chapter", "Virtual")
+    stage_book.open_with_picture(notebook, tmp_path / "images", "05_chapter", "Simulated")
     assert (tmp_path / "images/opening-05_chapter.png").read_bytes() == b"c"
     lines = notebook.cells[0].source.split("\n")
     assert lines[:3] == ["# Title", "", "Purpose."] and ":alt: Alt of fig-c" in lines
     assert "```{image} ../images/opening-05_chapter.png" in lines
-    assert "C (virtual data) ({numref}`fig-c`)." in lines
+    assert "C (simulated data) ({numref}`fig-c`)." in lines
 
 
 def test_chapter_without_a_drawn_picture_opens_without_one(tmp_path: Path) -> None:
@@ -328,7 +326,7 @@ def test_every_chapter_has_a_figure_that_opens_it() -> None:
 
 # ---- captions -------------------------------------------------------------------------------------------------
 
-WORDS = {"real": r"\breal\b", "simulated": r"\b(simulated|virtual)\b"}
+WORDS = {"real": r"\breal\b", "simulated": r"\bsimulated\b"}
 
 
 def figure_cell(caption: str, **metadata: str) -> nbformat.NotebookNode:
@@ -343,8 +341,8 @@ def figure_cell(caption: str, **metadata: str) -> nbformat.NotebookNode:
         ("Errors.", "session", "Errors. Real data."),
         ("Errors ({glue:text}`kind` data).", "session", "Errors ({glue:text}`kind` data)."),
         ("Errors of real RADIATE pairs.", "real", "Errors of real RADIATE pairs."),
-        ("Errors on the virtual route.", "simulated", "Errors on the virtual route."),
-        ("Real and virtual.", "both", "Real and virtual."),
+        ("Errors on the simulated route.", "simulated", "Errors on the simulated route."),
+        ("Real and simulated.", "both", "Real and simulated."),
     ],
 )
 def test_only_captions_of_the_sessions_are_completed(caption: str, data: str, completed: str) -> None:
@@ -353,7 +351,7 @@ def test_only_captions_of_the_sessions_are_completed(caption: str, data: str, co
     assert notebook.cells[0].metadata.mystnb.figure.caption == completed
 
 
-@pytest.mark.parametrize("metadata", [{}, {"data": "virtual"}])
+@pytest.mark.parametrize("metadata", [{}, {"data": "simulated"}])
 def test_figure_that_does_not_state_its_data_is_refused(metadata: dict) -> None:
     notebook = nbformat.v4.new_notebook(cells=[figure_cell("Errors.", **metadata)])
     with pytest.raises(ChapterError, match="figure fig-a: `data` .* none of session, real, simulated, both"):
@@ -363,14 +361,14 @@ def test_figure_that_does_not_state_its_data_is_refused(metadata: dict) -> None:
 @pytest.mark.parametrize("chapter", CHAPTERS)
 def test_every_caption_names_the_data_of_its_figure(chapter: str) -> None:
     notebook = nbformat.read(NOTEBOOKS / f"{chapter}.ipynb", as_version=4)
-    stage_book.complete_captions(notebook, "Virtual")
+    stage_book.complete_captions(notebook, "Simulated")
     for cell in notebook.cells:
         figure = cell.metadata.get("mystnb", {}).get("figure", {})
         if "caption" in figure:
             data, caption = cell.metadata["data"], figure["caption"]
             is_said = {name: bool(re.search(word, caption, re.IGNORECASE)) for name, word in WORDS.items()}
             if data == "session":
-                assert (stage_book.GLUED_KIND in caption) != caption.endswith(" Virtual data."), caption
+                assert (stage_book.GLUED_KIND in caption) != caption.endswith(" Simulated data."), caption
             else:
                 assert all(is_said.values()) if data == "both" else is_said[data], caption
-                assert not caption.endswith((" Virtual data.", " Real data.")), caption
+                assert not caption.endswith((" Simulated data.", " Real data.")), caption

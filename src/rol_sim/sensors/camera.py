@@ -1,4 +1,4 @@
-"""Pictures of the virtual town for the reader: a plan from above and a view from a place. No sensor uses them."""
+"""Pictures of the simulated town for the reader: a plan from above and a view from a place. No sensor uses them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The virtual HDL-32E: one turn of 32 lasers while the car moves, in the units of Oxford's raw files.
+"""The simulated HDL-32E: one turn of 32 lasers while the car moves, in the units of Oxford's raw files.
 
 Radar frame: x forward, y left, z up, level, above the ground by the mast's height. The lidar's place in it
 is its extrinsic calibration. Angles run clockwise seen from above, 0 to the lidar's left, elevations
@@ -50,7 +50,7 @@ SURFACES = {
 
 @dataclass(frozen=True)
 class LidarSettings:
-    """Settings of the virtual lidar.
+    """Settings of the simulated lidar.
 
     Attributes
     ----------

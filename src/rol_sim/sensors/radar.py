@@ -1,4 +1,4 @@
-"""A virtual CTS350-X: what a turning 77 GHz radar sees of a scene of triangles.
+"""A simulated CTS350-X: what a turning 77 GHz radar sees of a scene of triangles.
 
 A fan of rays, a few per azimuth and height layer, is cast once per turn; each ray starts where the radar is
 at that moment. Surfaces answer by material, angle and a fixed grain of the world, leaves let part of the
@@ -30,7 +30,7 @@ WEAKEST_ONWARD = 3.0  # a ray is followed on while a perfect scatterer would ret
 
 @dataclass(frozen=True)
 class RadarSettings:
-    """What can be tuned about the virtual radar.
+    """What can be tuned about the simulated radar.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""A virtual session before it is a folder: the town as it finds it, drive, traffic, times, scans, sweeps.
+"""A simulated session before it is a folder: the town as it finds it, drive, traffic, times, scans, sweeps.
 
 Every scan and sweep has a generator of its own, so each can be made alone and in any order; `writer` puts
 them on disk.
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from rol_sim.drive.traffic import Traffic
     from rol_sim.sensors.lidar import LidarSettings, Sweep
     from rol_sim.sensors.radar import RadarSettings
-    from rol_sim.session.settings import SessionSettings, VirtualSettings
+    from rol_sim.session.settings import SessionSettings, SimulationSettings
     from rol_sim.world.mapped import Cells
     from rol_sim.world.mesh import Mesh
     from rol_sim.world.scene import Scene
@@ -36,12 +36,12 @@ DRESS, DRIVE, TRAFFIC, SCANS, SWEEPS, ODOMETRY, GPS, INS, SCAN, SWEEP = range(10
 
 
 @dataclass(frozen=True)
-class VirtualSession:
+class SimulatedSession:
     """A session before it is written: the town as it finds it, its drive, its traffic and its times.
 
     Attributes
     ----------
-    settings : VirtualSettings
+    settings : SimulationSettings
         The settings of all sessions.
     name : str
         The session.
@@ -63,7 +63,7 @@ class VirtualSession:
         Which of these turns are written.
     """
 
-    settings: VirtualSettings
+    settings: SimulationSettings
     name: str
     town: Town | None
     ground: Callable[[np.ndarray], np.ndarray]
@@ -92,23 +92,23 @@ class VirtualSession:
         )
 
 
-def _generator(settings: VirtualSettings, name: str, part: int, index: int = 0) -> np.random.Generator:
+def _generator(settings: SimulationSettings, name: str, part: int, index: int = 0) -> np.random.Generator:
     return np.random.default_rng([settings.seed, settings.sessions[name].seed, part, index])
 
 
-def build_session(settings: VirtualSettings, name: str) -> VirtualSession:
+def build_session(settings: SimulationSettings, name: str) -> SimulatedSession:
     """Build the town as one session finds it, and plan its drive.
 
     Parameters
     ----------
-    settings : VirtualSettings
+    settings : SimulationSettings
         The settings.
     name : str
         The session.
 
     Returns
     -------
-    session : VirtualSession
+    session : SimulatedSession
         Ready for `make_scan` and `make_sweep`.
 
     Raises
@@ -134,17 +134,17 @@ def build_session(settings: VirtualSettings, name: str) -> VirtualSession:
     sweeps = {sensor: logs.schedule_sweeps(*span, rng(SWEEPS, k)) for k, sensor in enumerate(LIDARS)}
     kind = own.sweeps or settings.sweeps
     chosen = {sensor: logs.choose_sweeps(us, scans, turns, kind) for sensor, us in sweeps.items()}
-    return VirtualSession(
+    return SimulatedSession(
         settings, name, town, ground, Scene(mesh), drive, traffic, scans, turns, sweeps, chosen
     )
 
 
-def load_route(settings: VirtualSettings, own: SessionSettings) -> np.ndarray:
+def load_route(settings: SimulationSettings, own: SessionSettings) -> np.ndarray:
     """Read the real poses that a session of the route is driven along.
 
     Parameters
     ----------
-    settings : VirtualSettings
+    settings : SimulationSettings
         Where the real data lie.
     own : SessionSettings
         The number of the pose file, the first scan and how many.
@@ -165,7 +165,7 @@ def load_route(settings: VirtualSettings, own: SessionSettings) -> np.ndarray:
     root = rall.find_real_root(settings.real_root)
     if root is None:
         raise SettingsError(
-            f"virtual: world: route: no real data in {settings.real_root or 'ROL_REAL_ROOT or data/real'}; "
+            f"simulated: world: route: no real data in {settings.real_root or 'ROL_REAL_ROOT or data/real'}; "
             "run `make real` or set ROL_REAL_ROOT"
         )
     path = root / rall.POSES_PATH / f"pose_xy_{own.poses}.txt"
@@ -178,7 +178,7 @@ def load_route(settings: VirtualSettings, own: SessionSettings) -> np.ndarray:
 
 
 def _find_town(
-    settings: VirtualSettings, own: SessionSettings, scans: np.ndarray, turns: np.ndarray, rng: Callable
+    settings: SimulationSettings, own: SessionSettings, scans: np.ndarray, turns: np.ndarray, rng: Callable
 ) -> tuple[Town, Callable[[np.ndarray], np.ndarray], Mesh, Drive, Traffic]:
     """The town as one session finds it, and who is on the move."""
     from rol_sim.drive.planned import build_route, plan_drive
@@ -204,7 +204,11 @@ def _find_town(
 
 
 def _find_route(
-    settings: VirtualSettings, own: SessionSettings, poses: np.ndarray, middles_us: np.ndarray, rng: Callable
+    settings: SimulationSettings,
+    own: SessionSettings,
+    poses: np.ndarray,
+    middles_us: np.ndarray,
+    rng: Callable,
 ) -> tuple[Mesh, Drive, Traffic]:
     """The world of the map as one session finds it, and who is on the move."""
     from rol.maps import thin_points
@@ -236,8 +240,8 @@ def _find_route(
     return merge_meshes([*things, parked]), drive, traffic
 
 
-def build_twins(real_root: Path | str, seed: int = 1, margin_s: float = 30.0) -> VirtualSession:
-    """Prepare virtual twins of the real scans whose poses on the real map are known.
+def build_twins(real_root: Path | str, seed: int = 1, margin_s: float = 30.0) -> SimulatedSession:
+    """Prepare simulated twins of the real scans whose poses on the real map are known.
 
     The world is that of the route; the car drives through the poses of the scans, before and after them it goes on
     as it went.
@@ -253,7 +257,7 @@ def build_twins(real_root: Path | str, seed: int = 1, margin_s: float = 30.0) ->
 
     Returns
     -------
-    session : VirtualSession
+    session : SimulatedSession
         Ready for `make_scan`; the stamps are those of the real scans. It has no sweeps.
 
     Raises
@@ -262,17 +266,17 @@ def build_twins(real_root: Path | str, seed: int = 1, margin_s: float = 30.0) ->
         If a file of the real data is missing or at fault.
     """
     from rol_data import rall
-    from rol_sim.session.settings import SessionSettings, VirtualSettings
+    from rol_sim.session.settings import SessionSettings, SimulationSettings
     from rol_sim.world.scene import Scene
 
     known = rall.load_scan_poses(rall.find_scan_poses(real_root))
     stamps, poses = np.array(list(known), dtype=np.int64), np.array(list(known.values()))
     turns = np.full(len(stamps), 250_000, dtype=np.int64)
-    name = "virtual-twins"
+    name = "sim-twins"
     own = SessionSettings(
         "2019-01-10T14:37:26", len(stamps), seed, parked_share=0.15, vehicles=10, people=6, sweeps="none"
     )
-    settings = VirtualSettings({name: own}, seed=seed, world="route", real_root=str(real_root))
+    settings = SimulationSettings({name: own}, seed=seed, world="route", real_root=str(real_root))
     rng = partial(_generator, settings, name)
     before, after = np.arange(-margin_s, -0.1, 0.25), np.arange(0.25, margin_s, 0.25)
     middles = stamps + turns // 2
@@ -290,7 +294,9 @@ def build_twins(real_root: Path | str, seed: int = 1, margin_s: float = 30.0) ->
     )
     mesh, drive, traffic = _find_route(settings, own, way, times, rng)
     none: dict[str, np.ndarray] = {sensor: np.zeros(0, dtype=np.int64) for sensor in LIDARS}
-    return VirtualSession(settings, name, None, _flat, Scene(mesh), drive, traffic, stamps, turns, none, none)
+    return SimulatedSession(
+        settings, name, None, _flat, Scene(mesh), drive, traffic, stamps, turns, none, none
+    )
 
 
 def _flat(places: np.ndarray) -> np.ndarray:
@@ -315,12 +321,12 @@ def _build_town(seed: int, loop_m: float, relief_m: float) -> Town:
     return build_town(np.random.default_rng([seed, 0, 99]), loop_length=loop_m, relief=relief_m)
 
 
-def make_scan(session: VirtualSession, index: int) -> RadarScan:
+def make_scan(session: SimulatedSession, index: int) -> RadarScan:
     """Make one radar scan.
 
     Parameters
     ----------
-    session : VirtualSession
+    session : SimulatedSession
         The session.
     index : int
         Which scan.
@@ -361,12 +367,12 @@ def make_scan(session: VirtualSession, index: int) -> RadarScan:
     )
 
 
-def make_sweep(session: VirtualSession, sensor: str, index: int) -> Sweep:
+def make_sweep(session: SimulatedSession, sensor: str, index: int) -> Sweep:
     """Make one lidar sweep.
 
     Parameters
     ----------
-    session : VirtualSession
+    session : SimulatedSession
         The session.
     sensor : str
         "velodyne_left" or "velodyne_right".
@@ -399,7 +405,7 @@ def label_sweep(folder: Path | str, sensor: str, stamp_us: int) -> tuple[np.ndar
     Parameters
     ----------
     folder : path
-        Folder of a virtual session.
+        Folder of a simulated session.
     sensor : str
         "velodyne_left" or "velodyne_right".
     stamp_us : int
@@ -435,19 +441,19 @@ def label_sweep(folder: Path | str, sensor: str, stamp_us: int) -> tuple[np.ndar
 
 
 def list_labels(folder: Path | str, sensor: str) -> np.ndarray:
-    """List the sweeps of a virtual session whose true materials were written, shape (n,), int64 [us]."""
+    """List the sweeps of a simulated session whose true materials were written, shape (n,), int64 [us]."""
     return np.array(
         sorted(int(path.stem) for path in (Path(folder) / "labels" / sensor).glob("[!.]*.png")),
         dtype=np.int64,
     )
 
 
-def sensor_settings(settings: VirtualSettings) -> tuple[LidarSettings, RadarSettings]:
+def sensor_settings(settings: SimulationSettings) -> tuple[LidarSettings, RadarSettings]:
     """Give the settings of both sensors, the usual ones where nothing else is asked for.
 
     Parameters
     ----------
-    settings : VirtualSettings
+    settings : SimulationSettings
         The settings of all sessions.
 
     Returns
@@ -475,10 +481,10 @@ def _fill(kind: type, values: dict[str, Any], name: str) -> Any:
     known = [f.name for f in fields(kind)]
     unknown = sorted(set(values) - set(known))
     if unknown:
-        raise SettingsError(f"virtual: {name}: unknown key {unknown[0]!r}; known are: {', '.join(known)}")
+        raise SettingsError(f"simulated: {name}: unknown key {unknown[0]!r}; known are: {', '.join(known)}")
     try:
         return kind(
             **{key: tuple(value) if isinstance(value, list) else value for key, value in values.items()}
         )
     except ValueError as error:
-        raise SettingsError(f"virtual: {name}: {error}") from error
+        raise SettingsError(f"simulated: {name}: {error}") from error

@@ -1,4 +1,4 @@
-"""The settings of virtual sessions: what may stand in the `virtual:` section of a config file."""
+"""The settings of simulated sessions: what may stand in the `simulated:` section of a config file."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class SessionSettings:
     vehicles, people : int
         Traffic: how many there are in the town, or how many come towards the car in a minute of the route.
     sweeps : str
-        As in `VirtualSettings`, for this session; empty: as there.
+        As in `SimulationSettings`, for this session; empty: as there.
     poses : str
         World "route" only: number of the pose file that is driven, such as "02". Speed, stops and the time of
         standing are then the true ones.
@@ -95,7 +95,7 @@ class SessionSettings:
 
 
 @dataclass(frozen=True)
-class VirtualSettings:
+class SimulationSettings:
     """What all sessions of a config share, and the sessions.
 
     Attributes
@@ -164,19 +164,19 @@ class VirtualSettings:
         check_fields(self, allowed, SettingsError)
 
 
-def parse_settings(section: Mapping[str, Any], where: str = "virtual") -> VirtualSettings:
-    """Read the `virtual:` section of a config.
+def parse_settings(section: Mapping[str, Any], where: str = "simulated") -> SimulationSettings:
+    """Read the `simulated:` section of a config.
 
     Parameters
     ----------
     section : mapping
-        The section; keys are the attributes of `VirtualSettings`, `sessions` maps names to mappings.
+        The section; keys are the attributes of `SimulationSettings`, `sessions` maps names to mappings.
     where : str
         What the section is called in messages, such as the file's name.
 
     Returns
     -------
-    settings : VirtualSettings
+    settings : SimulationSettings
         Checked settings.
 
     Raises
@@ -188,8 +188,8 @@ def parse_settings(section: Mapping[str, Any], where: str = "virtual") -> Virtua
     sessions = {}
     for name, values in _as_mapping(section.pop("sessions", {}), f"{where}: sessions").items():
         place = f"{where}: session {name}"
-        if not str(name).startswith("virtual-"):
-            raise SettingsError(f"{place}: names of virtual sessions begin with 'virtual-'")
+        if not str(name).startswith("sim-"):
+            raise SettingsError(f"{place}: names of simulated sessions begin with 'sim-'")
         values = _as_mapping(values, place)
         if "start" not in values:
             raise SettingsError(f"{place}: the key 'start' is missing")
@@ -203,11 +203,11 @@ def parse_settings(section: Mapping[str, Any], where: str = "virtual") -> Virtua
                 f"{place}: scans: {session.scans} is too few, 3 are needed for one step of odometry"
             )
         sessions[str(name)] = session
-    return _fill(VirtualSettings, section, where, sessions=sessions)
+    return _fill(SimulationSettings, section, where, sessions=sessions)
 
 
-def load_settings(path: Path | str) -> VirtualSettings:
-    """Read the `virtual:` section of a config file in YAML.
+def load_settings(path: Path | str) -> SimulationSettings:
+    """Read the `simulated:` section of a config file in YAML.
 
     Parameters
     ----------
@@ -216,7 +216,7 @@ def load_settings(path: Path | str) -> VirtualSettings:
 
     Returns
     -------
-    settings : VirtualSettings
+    settings : SimulationSettings
         Checked settings.
 
     Raises
@@ -232,12 +232,12 @@ def load_settings(path: Path | str) -> VirtualSettings:
         content = yaml.safe_load(read_text(path))
     except (OSError, ValueError, yaml.YAMLError) as error:
         raise SettingsError(f"{path}: cannot be read: {error}") from error
-    if not isinstance(content, Mapping) or "virtual" not in content:
-        raise SettingsError(f"{path}: no section 'virtual'")
-    return parse_settings(content["virtual"], f"{path}: virtual")
+    if not isinstance(content, Mapping) or "simulated" not in content:
+        raise SettingsError(f"{path}: no section 'simulated'")
+    return parse_settings(content["simulated"], f"{path}: simulated")
 
 
-def read_settings(path: Path | str) -> VirtualSettings:
+def read_settings(path: Path | str) -> SimulationSettings:
     """Read the settings that a session was made with back from its `settings.json`.
 
     Parameters
@@ -247,7 +247,7 @@ def read_settings(path: Path | str) -> VirtualSettings:
 
     Returns
     -------
-    settings : VirtualSettings
+    settings : SimulationSettings
         The shared settings and this one session.
 
     Raises
@@ -267,12 +267,12 @@ def read_settings(path: Path | str) -> VirtualSettings:
     return parse_settings(section, str(path))
 
 
-def describe(settings: VirtualSettings, name: str) -> dict[str, Any]:
+def describe(settings: SimulationSettings, name: str) -> dict[str, Any]:
     """Give all settings that bear on one session as plain values, for its json files.
 
     Parameters
     ----------
-    settings : VirtualSettings
+    settings : SimulationSettings
         The settings.
     name : str
         The session.

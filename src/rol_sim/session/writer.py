@@ -1,4 +1,4 @@
-"""The session writer: a virtual session on disk in Oxford's own files.
+"""The session writer: a simulated session on disk in Oxford's own files.
 
 A session that was interrupted goes on with the same bytes: files that are there are whole (they get their
 names last) and are kept. `settings.json` is written first and tells whether the files belong to the settings
@@ -21,8 +21,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 if TYPE_CHECKING:
-    from rol_sim.session.assembly import VirtualSession
-    from rol_sim.session.settings import VirtualSettings
+    from rol_sim.session.assembly import SimulatedSession
+    from rol_sim.session.settings import SimulationSettings
 
 SCAN_BYTES, SWEEP_BYTES = 470_000, 65_000  # what a file takes on the mean
 FORMAT = 4  # raise it when the same settings give other files
@@ -41,7 +41,7 @@ _MADE = (
 
 
 def write_session(
-    settings: VirtualSettings,
+    settings: SimulationSettings,
     name: str,
     root: Path | str,
     report: Callable[[str], None] = lambda line: None,
@@ -52,7 +52,7 @@ def write_session(
 
     Parameters
     ----------
-    settings : VirtualSettings
+    settings : SimulationSettings
         The settings.
     name : str
         The session, also the folder's name.
@@ -98,14 +98,14 @@ def write_session(
     return folder
 
 
-def check_room(folder: Path, session: VirtualSession) -> str:
+def check_room(folder: Path, session: SimulatedSession) -> str:
     """Say how much will be written, and refuse if the disk has not the room.
 
     Parameters
     ----------
     folder : Path
         The session's folder, which exists; what is there already is not counted again.
-    session : VirtualSession
+    session : SimulatedSession
         The session.
 
     Returns
@@ -132,7 +132,7 @@ def check_room(folder: Path, session: VirtualSession) -> str:
 
 
 def _write_stretches(
-    folder: Path, session: VirtualSession, stretches: list[tuple[int, int]], jobs: int
+    folder: Path, session: SimulatedSession, stretches: list[tuple[int, int]], jobs: int
 ) -> Iterator[int]:
     """Write all scans and sweeps; gives how many scans are there after each stretch."""
     done = 0
@@ -154,10 +154,10 @@ def _write_stretches(
             pool.shutdown(wait=False, cancel_futures=True)
 
 
-_worker: tuple[Path, VirtualSession] | None = None
+_worker: tuple[Path, SimulatedSession] | None = None
 
 
-def _open_worker(folder: Path, settings: VirtualSettings, name: str) -> None:
+def _open_worker(folder: Path, settings: SimulationSettings, name: str) -> None:
     """Build the session once in each process."""
     from rol_sim.session.assembly import build_session
 
@@ -170,7 +170,7 @@ def _work(first: int, end: int) -> None:
     _write_stretch(*_worker, first, end)
 
 
-def _write_stretch(folder: Path, session: VirtualSession, first: int, end: int) -> None:
+def _write_stretch(folder: Path, session: SimulatedSession, first: int, end: int) -> None:
     """Write some scans and the sweeps that begin during them, or before the first and after the last one."""
     n = len(session.scans_us)
     low = session.scans_us[first] if first > 0 else np.iinfo(np.int64).min
@@ -214,7 +214,7 @@ def _prepare_folder(folder: Path, wanted: dict[str, Any], report: Callable[[str]
     return True
 
 
-def _write_scan(folder: Path, session: VirtualSession, index: int) -> None:
+def _write_scan(folder: Path, session: SimulatedSession, index: int) -> None:
     from rol.oxford import save_radar
     from rol_sim.session.assembly import make_scan
 
@@ -223,7 +223,7 @@ def _write_scan(folder: Path, session: VirtualSession, index: int) -> None:
         save_radar(path, make_scan(session, index))
 
 
-def _write_sweep(folder: Path, session: VirtualSession, sensor: str, place: int, index: int) -> None:
+def _write_sweep(folder: Path, session: SimulatedSession, sensor: str, place: int, index: int) -> None:
     from rol.oxford import VelodyneRaw, save_velodyne_raw
     from rol_sim.session.assembly import make_sweep
 
@@ -239,7 +239,7 @@ def _write_sweep(folder: Path, session: VirtualSession, sensor: str, place: int,
     save_velodyne_raw(path, VelodyneRaw(sweep.intensities, sweep.ranges, sweep.angles, sweep.stamps_us))
 
 
-def _write_logs(folder: Path, session: VirtualSession) -> None:
+def _write_logs(folder: Path, session: SimulatedSession) -> None:
     """Everything but scans and sweeps; session.json last."""
     from rol import oxford
     from rol.evaluation import write_tum
@@ -272,7 +272,7 @@ def _write_logs(folder: Path, session: VirtualSession) -> None:
     _write_json(folder / "session.json", _summarise(session, truth))
 
 
-def _summarise(session: VirtualSession, truth: np.ndarray) -> dict[str, Any]:
+def _summarise(session: SimulatedSession, truth: np.ndarray) -> dict[str, Any]:
     from rol_sim.session.settings import describe
 
     way = np.interp(

@@ -1,4 +1,4 @@
-"""The virtual town: rays against bodies worked out by hand, rules that every town keeps, the drive, the lidar."""
+"""The simulated town: rays against bodies worked out by hand, rules that every town keeps, the drive, the lidar."""
 
 import numpy as np
 import pytest

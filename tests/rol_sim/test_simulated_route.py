@@ -24,7 +24,7 @@ from rol_sim.session.settings import SettingsError, load_settings, parse_setting
 from rol_sim.world import mapped
 from rol_sim.world.mesh import Material
 
-NAME = "virtual-route-2019-01-10-12-32-52"
+NAME = "sim-route-2019-01-10-12-32-52"
 START = "2019-01-10T12:32:52"
 
 
@@ -76,7 +76,7 @@ def recipe(folder: Path, root: Path, **session: object) -> Path:
     }
     section = {"world": "route", "real_root": str(root), "seed": 5, "sessions": {NAME: own}}
     path = folder / "route.yaml"
-    path.write_text(yaml.safe_dump({"virtual": section}), encoding="utf-8")
+    path.write_text(yaml.safe_dump({"simulated": section}), encoding="utf-8")
     return path
 
 
@@ -287,7 +287,7 @@ def test_route_without_real_data_says_how_to_get_them(tmp_path: Path) -> None:
     with pytest.raises(SettingsError, match="world: 'moon' is none of town, route"):
         parse_settings({"world": "moon"})
     with pytest.raises(SettingsError, match="scans: 0 is too few"):
-        parse_settings({"sessions": {"virtual-a": {"start": START, "scans": 0}}})
+        parse_settings({"sessions": {"sim-a": {"start": START, "scans": 0}}})
 
 
 def test_twins_stand_where_the_real_scans_stood(real_root: Path) -> None:

@@ -1,4 +1,4 @@
-"""How real and virtual scans are held against each other: statistics of motion and map, and the classifier."""
+"""How real and simulated scans are held against each other: statistics of motion and map, and the classifier."""
 
 from pathlib import Path
 
@@ -101,7 +101,7 @@ def test_classifier_tells_what_differs_and_nothing_else() -> None:
 
 
 def test_twins_have_the_statistics_of_the_real_scans(real_root: Path) -> None:
-    """The calibration itself: targets that virtual scans must meet, on a seed that it was not set with."""
+    """The calibration itself: targets that simulated scans must meet, on a seed that it was not set with."""
     known = rall.load_scan_poses(rall.find_scan_poses(real_root))
     real = np.stack([load_radar(real_root / rall.SCANS_PATH / "radar" / f"{us}.png").codes for us in known])
     twins = build_twins(real_root, seed=11)

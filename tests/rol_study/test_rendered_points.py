@@ -11,14 +11,15 @@ import pytest
 from scipy.spatial import cKDTree
 
 from rol.geometry import transform_points
+from rol.pix2pix import TrainedNetwork
 from rol_beyond import front_ends
-from rol_beyond.front_ends import Translator, detect_points, judge_on_map
+from rol_beyond.front_ends import detect_points, judge_on_map
 from rol_data import rall
 from rol_study.rendered_points import build_stretch, render_clouds, true_twists
 
 pytestmark = pytest.mark.open3d
 QUIET = {"vehicles": 0, "people": 0, "parked_share": 0.0}
-NOBODY = Translator(None, {}, {}, {})  # type: ignore[arg-type]  # the detector below asks no network
+NOBODY = TrainedNetwork(None, {}, {}, {})  # type: ignore[arg-type]  # the detector below asks no network
 
 
 def drive_poses(n: int = 12) -> np.ndarray:
@@ -51,7 +52,7 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
     given: list[Any] = []
 
     def detect(
-        translator: Translator, codes: np.ndarray, azimuths: np.ndarray, twist: Any, **how: Any
+        translator: TrainedNetwork, codes: np.ndarray, azimuths: np.ndarray, twist: Any, **how: Any
     ) -> Any:
         given.append((translator, twist, how))
         return detect_points(codes, azimuths, twist), None, None
@@ -131,7 +132,7 @@ def test_an_untrained_network_on_the_real_route(real_root: Path) -> None:
 
     generator = build_generator(2, 1, rng=torch.Generator().manual_seed(1))
     generator.image_size = (512, 512)
-    translator = Translator(generator, {"threshold": 1}, {}, {})
+    translator = TrainedNetwork(generator, {"threshold": 1}, {}, {})
     clouds = list(render_clouds(real_root, "02", 6000, 3, translator, 3))
     assert len(clouds) == 3 and all(len(cloud) > 100 for cloud in clouds)
     assert max(np.abs(cloud).max() for cloud in clouds) < 64.0 * np.sqrt(2.0)

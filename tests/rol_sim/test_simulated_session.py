@@ -1,4 +1,4 @@
-"""Virtual sessions on disk: settings, times, odometry, and a small session written, interrupted and read back."""
+"""Simulated sessions on disk: settings, times, odometry, and a small session written, interrupted and read back."""
 
 import errno
 import hashlib
@@ -20,10 +20,10 @@ from rol_sim.session.settings import SettingsError, load_settings, parse_setting
 from rol_sim.world.mesh import GROUND_MATERIALS, Material
 
 pytestmark = pytest.mark.open3d
-NAME = "virtual-town-seq01"
+NAME = "sim-town-seq01"
 START = "2019-01-10T11:46:21"
 RECIPE = f"""
-virtual:
+simulated:
   seed: 3
   labels_every: 3
   sessions:
@@ -69,7 +69,7 @@ def test_settings_are_read(recipe: Path) -> None:
 @pytest.mark.parametrize(
     ("section", "message"),
     [
-        ({"sed": 1}, "virtual: unknown key 'sed'; known are: seed, loop_m"),
+        ({"sed": 1}, "simulated: unknown key 'sed'; known are: seed, loop_m"),
         ({"seed": -1}, "seed: -1 is not a whole number in"),
         ({"seed": 1.5}, "seed: expected int, got 1.5"),
         ({"loop_m": "long"}, "loop_m: expected float, got 'long'"),
@@ -80,18 +80,21 @@ def test_settings_are_read(recipe: Path) -> None:
         ({"labels_every": True}, "labels_every: expected int, got True"),
         ({"lidar": 3}, "lidar: expected dict, got 3"),
         ("town", "expected keys and values, got 'town'"),
-        ({"sessions": {"monday": {"start": START}}}, "session monday: names of virtual sessions begin with"),
-        ({"sessions": {"virtual-a": {}}}, "session virtual-a: the key 'start' is missing"),
-        ({"sessions": {"virtual-a": {"start": "noon"}}}, "start: 'noon' is not a date and time"),
-        ({"sessions": {"virtual-a": {"start": START, "scan": 4}}}, "unknown key 'scan'"),
-        ({"sessions": {"virtual-a": {"start": START, "scans": -4}}}, "scans: -4 is not a whole number in"),
         (
-            {"sessions": {"virtual-a": {"start": START, "vehicles": -1}}},
+            {"sessions": {"monday": {"start": START}}},
+            "session monday: names of simulated sessions begin with",
+        ),
+        ({"sessions": {"sim-a": {}}}, "session sim-a: the key 'start' is missing"),
+        ({"sessions": {"sim-a": {"start": "noon"}}}, "start: 'noon' is not a date and time"),
+        ({"sessions": {"sim-a": {"start": START, "scan": 4}}}, "unknown key 'scan'"),
+        ({"sessions": {"sim-a": {"start": START, "scans": -4}}}, "scans: -4 is not a whole number in"),
+        (
+            {"sessions": {"sim-a": {"start": START, "vehicles": -1}}},
             "vehicles: -1 is not a whole number in",
         ),
-        ({"sessions": {"virtual-a": {"start": START, "cruise_mps": 0}}}, "cruise_mps: 0.0 is not in"),
+        ({"sessions": {"sim-a": {"start": START, "cruise_mps": 0}}}, "cruise_mps: 0.0 is not in"),
         (
-            {"sessions": {"virtual-a": {"start": START, "parked_share": 1.2}}},
+            {"sessions": {"sim-a": {"start": START, "parked_share": 1.2}}},
             "parked_share: 1.2 is not in \\[0, 1\\]",
         ),
     ],
@@ -105,11 +108,11 @@ def test_bad_files_and_names_are_named(tmp_path: Path, recipe: Path) -> None:
     with pytest.raises(SettingsError, match="nowhere.yaml: cannot be read"):
         load_settings(tmp_path / "nowhere.yaml")
     (tmp_path / "other.yaml").write_text("profile: demo\n", encoding="utf-8")
-    with pytest.raises(SettingsError, match="other.yaml: no section 'virtual'"):
+    with pytest.raises(SettingsError, match="other.yaml: no section 'simulated'"):
         load_settings(tmp_path / "other.yaml")
-    with pytest.raises(SettingsError, match=f"no session 'virtual-b' in the settings; there are: {NAME}"):
-        writer.write_session(load_settings(recipe), "virtual-b", tmp_path)
-    assert not (tmp_path / "virtual-b").exists()
+    with pytest.raises(SettingsError, match=f"no session 'sim-b' in the settings; there are: {NAME}"):
+        writer.write_session(load_settings(recipe), "sim-b", tmp_path)
+    assert not (tmp_path / "sim-b").exists()
 
 
 def test_unknown_sensor_settings_are_named(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
@@ -363,5 +366,5 @@ def test_all_sweeps_can_be_had(recipe: Path) -> None:
 def test_command_line_tells_how_far_it_is(folder: Path, recipe: Path, capsys: pytest.CaptureFixture) -> None:
     assert main([str(recipe), "--session", NAME, "--out", str(folder.parent)]) == 0
     assert capsys.readouterr().out == f"{NAME}: complete already\n"
-    assert main([str(recipe), "--session", "virtual-x", "--out", str(folder.parent)]) == 1
-    assert "error: no session 'virtual-x'" in capsys.readouterr().err
+    assert main([str(recipe), "--session", "sim-x", "--out", str(folder.parent)]) == 1
+    assert "error: no session 'sim-x'" in capsys.readouterr().err

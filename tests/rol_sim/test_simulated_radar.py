@@ -1,4 +1,4 @@
-"""The virtual radar against plates, hedges and walls at known places, its statistics against real scans."""
+"""The simulated radar against plates, hedges and walls at known places, its statistics against real scans."""
 
 import cv2
 import numpy as np
