@@ -12,9 +12,9 @@ from scipy.spatial import cKDTree
 
 from rol.geometry import transform_points
 from rol.pix2pix import TrainedNetwork
-from rol_beyond import front_ends
 from rol_beyond.front_ends import detect_points, judge_on_map
 from rol_data import rall
+from rol_study import rendered_points
 from rol_study.rendered_points import build_segment, render_points, true_twists
 
 pytestmark = pytest.mark.open3d
@@ -57,7 +57,7 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
         given.append((translator, twist, how))
         return detect_points(codes, azimuths, twist), None, None
 
-    monkeypatch.setattr(front_ends, "translate_scan", detect)
+    monkeypatch.setattr(rendered_points, "translate_scan", detect)
     return given
 
 
