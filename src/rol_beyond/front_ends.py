@@ -156,7 +156,7 @@ def even_out(points: np.ndarray, radius_m: float, rng: np.random.Generator) -> n
     """
     from scipy.spatial import cKDTree
 
-    from rol.mcl import resample_systematic
+    from rol_beyond.resampling import resample_systematic
 
     if len(points) == 0:
         return points
