@@ -48,7 +48,7 @@ from rol.fakes import list_fakes, read_image
 from rol.files import write_text
 from rol.geometry import accumulate_increments, compose, relative_pose, transform_points
 from rol.odometry import chain, correct_cloud, fit_rigid, icp_2d, local_map_odometry
-from rol.radar import KIT_RANGE_RESOLUTION, MEASURED_RANGE_RESOLUTION
+from rol.radar import MEASURED, SDK
 from rol_data import rall
 
 try:
@@ -59,7 +59,7 @@ except ImportError:
 CFEAR_PCT = (
     1.3  # drift of CFEAR-3 from Oxford's raw radar, sessions of its authors' choice (Adolfsson et al. 2023)
 )
-LONGER = MEASURED_RANGE_RESOLUTION / KIT_RANGE_RESOLUTION  # a range bin as measured, beside the kit's
+LONGER = MEASURED.resolution_m / SDK.resolution_m  # length of a range bin as measured over the SDK's
 REAL_SESSIONS = {"01": "2019-01-10-11-46-21", "02": "2019-01-10-12-32-52", "07": "2019-01-11-12-26-55"}
 MAX_DISTANCE_M = 1.0  # of a pair, for the peers: our ICP's last limit; with 2 or 3 m they drift more
 ITERATIONS = 30  # at most, for all

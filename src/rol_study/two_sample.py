@@ -136,12 +136,10 @@ def give_aways(verdict: Verdict, real: np.ndarray, simulated: np.ndarray) -> dic
         "range": area under the curve of patches by range "low-high" [m]; "brightest": by the brightest code
         in the patch. 0.5 where it cannot tell.
     """
-    from rol_study.radar_statistics import MEASURED_RANGE_RESOLUTION
+    from rol.radar import MEASURED
 
     peaks = np.stack([cut_patches(real), cut_patches(simulated)]).max(axis=(-1, -2))
-    range_m = np.broadcast_to(
-        (np.arange(peaks.shape[3]) + 0.5) * BINS * MEASURED_RANGE_RESOLUTION, peaks.shape
-    )
+    range_m = np.broadcast_to((np.arange(peaks.shape[3]) + 0.5) * BINS * MEASURED.resolution_m, peaks.shape)
     found: dict[str, dict[str, float]] = {}
     cases = (
         ("range", range_m, (0, 3, 10, 25, 50, 80, 110, 170)),
