@@ -227,7 +227,7 @@ def read_points(
         If the folder is not complete or an image cannot be read; the message names the file.
     """
     from .bev import image_to_points
-    from .radar import compensate_points
+    from .radar import ScanMotion, compensate_points
 
     folder = Path(folder)
     how = list_fakes(folder)[1]
@@ -236,7 +236,7 @@ def read_points(
         twists = [None] * len(stamps_us)
     for stamp, twist in zip(stamps_us, twists, strict=True):
         points = image_to_points(read_image(folder / f"{int(stamp)}.png"), **how)
-        yield points if twist is None else compensate_points(points, twist)
+        yield points if twist is None else compensate_points(points, ScanMotion(twist))
 
 
 def read_image(path: str | Path) -> np.ndarray:

@@ -158,7 +158,7 @@ def load_lidar_points(
     """
     from .lidar import relate_sensors, sweep_to_radar
     from .oxford import EXTRINSICS, load_sweep
-    from .radar import undistort_points
+    from .radar import deskew_points
 
     if twist is not None and mid_stamp_us is None:
         raise ValueError("a twist needs mid_stamp_us, the time to move the points to")
@@ -171,7 +171,7 @@ def load_lidar_points(
         points, stamps_us = load_sweep(session, sensor, int(stamp))
         points = sweep_to_radar(points, relate_sensors(EXTRINSICS["radar"], EXTRINSICS[sensor]))
         if twist is not None:
-            points[:, :3] = undistort_points(points[:, :3], (stamps_us - int(mid_stamp_us)) / 1e6, twist)
+            points[:, :3] = deskew_points(points[:, :3], (stamps_us - int(mid_stamp_us)) / 1e6, twist)
         clouds.append(points)
     return np.concatenate(clouds)
 
@@ -227,7 +227,7 @@ def build_pair(
     from .bev import points_to_image
     from .lidar import crop_range, remove_ground
     from .oxford import load_radar
-    from .radar import polar_to_cartesian
+    from .radar import RangeCalibration, ScanMotion, polar_to_cartesian
 
     if motion not in ("none", "corrected"):
         raise ValueError(f"motion must be 'none' or 'corrected', not {motion!r}")
@@ -239,12 +239,10 @@ def build_pair(
     power = polar_to_cartesian(
         scan.power,
         scan.azimuths,
-        range_resolution=range_resolution,
-        range_offset=range_offset,
+        calibration=RangeCalibration(range_resolution, range_offset),
         pixel_size=pixel_size,
         width=width,
-        twist=twist,
-        doppler_seconds=doppler_seconds,
+        motion=None if twist is None else ScanMotion(twist, doppler_seconds=doppler_seconds),
     )
     points = load_lidar_points(session, left_stamp, right_stamp, mid_stamp_us=mid_stamp_us, twist=twist)
     points = crop_range(remove_ground(points, min_height), max_range)
