@@ -48,13 +48,13 @@ def open_scans(given: str, n_simulated: int = 11) -> tuple[list[Scan], str]:
     root = rall.find_real_root(given)
     if root is not None:
         scans = rall.load_scans(root)
-        return [(scan.codes, scan.azimuths) for scan in scans], f"{len(scans)} real scans"
+        return [(scan.power, scan.azimuths) for scan in scans], f"{len(scans)} real scans"
     folder = ROOT / "data" / "sessions" / "demo" / "sim-town-seq01"
     if not folder.is_dir():
         raise SystemExit(f"{folder}: missing, and no real data at hand; `make book` makes the session")
     stamps_us = load_timestamps(folder / "radar.timestamps")[:n_simulated]
     loaded = [load_radar(folder / "radar" / f"{us}.png") for us in stamps_us]
-    return [(scan.codes, scan.azimuths) for scan in loaded], f"{len(loaded)} simulated scans"
+    return [(scan.power, scan.azimuths) for scan in loaded], f"{len(loaded)} simulated scans"
 
 
 def list_front_ends(full_width: int = 64) -> dict[str, FrontEnd]:

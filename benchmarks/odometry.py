@@ -46,7 +46,7 @@ from rol.bev import image_to_points
 from rol.evaluation import KITTI_LENGTHS_M, drift_by_length, pose_errors, read_tum, rmse
 from rol.fakes import list_fakes, read_image
 from rol.files import write_text
-from rol.geometry import accumulate_steps, compose, relative_pose, transform_points
+from rol.geometry import accumulate_increments, compose, relative_pose, transform_points
 from rol.odometry import chain, correct_cloud, fit_rigid, icp_2d, local_map_odometry
 from rol.radar import KIT_RANGE_RESOLUTION, MEASURED_RANGE_RESOLUTION
 from rol_data import rall
@@ -208,7 +208,7 @@ def take_turns(ways: dict[str, Steps], n_steps: int) -> tuple[dict[str, np.ndarr
 def judge(steps: np.ndarray, truth: np.ndarray, longest_m: float) -> dict[str, float]:
     """Drift over stretches up to a length, and the errors of single steps."""
     lengths_m = tuple(length for length in KITTI_LENGTHS_M if length <= longest_m)
-    report = drift_by_length(accumulate_steps(steps), truth, lengths_m)
+    report = drift_by_length(accumulate_increments(steps), truth, lengths_m)
     errors = pose_errors(steps, relative_pose(truth[:-1], truth[1:]))
     return {
         "drift [%]": report.mean_translation_pct,

@@ -176,12 +176,12 @@ def measure_rendered(real_root: str, number: str, first: int, n_scans: int, seed
     import torch
 
     from rol.pix2pix import load_network
-    from rol_study.rendered_points import render_clouds
+    from rol_study.rendered_points import render_points
 
     torch.set_num_threads(1)
     stage = stage_of(real_root, number, (0.80, 0.88))
     translator = load_network(ROOT / "data" / "weights" / "rol.safetensors")
-    clouds = list(render_clouds(real_root, number, first, n_scans, translator, seed))
+    clouds = list(render_points(real_root, number, first, n_scans, translator, seed))
     truth, steps = stage.route.truth[first : first + n_scans], stage.route.steps[first : first + n_scans - 1]
     part = replace(stage, route=Route(number, truth, steps))
     return [row_of(part, run_method(part, method, clouds, seed), method, seed) for method in ("paper", "rol")]

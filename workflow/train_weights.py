@@ -141,7 +141,7 @@ def judge(
     ]  # fmt: skip
     rows, translator = [], TrainedNetwork(generator, {}, settings, {})
     for scan in [] if real is None else real[0]:
-        _, _, fake = translate_scan(translator, scan.codes, scan.azimuths, scan.twist)
+        _, _, fake = translate_scan(translator, scan.power, scan.azimuths, scan.twist)
         for level in LEVELS:
             points = image_to_points(fake, threshold=level, min_range=MIN_RANGE_M, thin=thin)
             shares = judge_on_map(points, scan.pose, real[1])

@@ -92,7 +92,7 @@ def estimate_twists(odometry: Any) -> np.ndarray:
     ValueError
         If there is no step, a step takes no time, or the steps are not one chain.
     """
-    steps = np.asarray(odometry.steps, dtype=np.float64)
+    steps = np.asarray(odometry.increments, dtype=np.float64)
     later, earlier = np.asarray(odometry.source_stamps_us), np.asarray(odometry.destination_stamps_us)
     if len(steps) == 0:
         raise ValueError("odometry: no step to take a velocity from")
@@ -237,7 +237,7 @@ def build_pair(
     mid_stamp_us = int(radar_stamp) + 125_000 if mid_stamp_us is None else int(mid_stamp_us)
     scan = load_radar(session.radar_path(int(radar_stamp)))
     power = polar_to_cartesian(
-        scan.codes,
+        scan.power,
         scan.azimuths,
         range_resolution=range_resolution,
         range_offset=range_offset,

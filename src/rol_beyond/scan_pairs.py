@@ -106,7 +106,7 @@ class ScanPairs:
         from rol.oxford import load_radar
 
         scan = load_radar(self.session.radar_path(self.jobs[index]["radar_stamp"]))
-        codes = shift_codes(scan.codes, gain_db)
+        codes = shift_codes(scan.power, gain_db)
         if n_streaks + n_ghosts > 0:
             if rng is None:
                 raise ValueError("streaks and ghosts need a generator of random numbers")

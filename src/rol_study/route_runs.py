@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from rol_beyond.motion import MotionModel
     from rol_beyond.recovery import RecoverySettings, RecoveryUpdate
     from rol_study.route import RecoveryTrial, Route, RouteRun
-    from rol_study.sampled_points import FrontEnd, Sight
+    from rol_study.sampled_points import FrontEnd, VisiblePoints
 
 CELL_M = 0.25  # of the filter's grid: the pixel of the real map
 
@@ -38,7 +38,7 @@ class Stage:
         The real map [m].
     front_end : FrontEnd
         What the points are like.
-    sight : Sight
+    sight : VisiblePoints
         What of the map can be seen from each true pose.
     parts : array, shape (3,)
         Parts of near points, points beside and false ones that have the front end's shares over the whole session.
@@ -56,7 +56,7 @@ class Stage:
     route: Route
     map_points: np.ndarray
     front_end: FrontEnd
-    sight: Sight
+    sight: VisiblePoints
     parts: np.ndarray
     model: MotionModel
     teacher: str
@@ -102,7 +102,7 @@ def set_stage(
     from rol.mcl import build_grid, settings_for
     from rol_data.rall import MAP_PATH, MAP_SHAPE, load_map_points
     from rol_study.route import Route, learn_from_others, load_route
-    from rol_study.sampled_points import look_around
+    from rol_study.sampled_points import find_visible_points
 
     map_points = load_map_points(Path(real_root, MAP_PATH), MAP_SHAPE)
     route = load_route(real_root, number, map_points)
@@ -114,7 +114,7 @@ def set_stage(
     poses = poses[np.linspace(0, len(poses) - 1, min(n_level, len(poses))).astype(int)]
     grid = build_grid(map_points, settings or settings_for("rol"))
     level = _learn_level(map_points, poses, front_end, grid)
-    sight = look_around(map_points, route.truth)
+    sight = find_visible_points(map_points, route.truth)
     return Stage(route, map_points, front_end, sight, parts, model, teacher, level, grid)
 
 
@@ -122,22 +122,22 @@ def _learn_level(map_points: np.ndarray, poses: np.ndarray, front_end: FrontEnd,
     """Learn from another session's true poses how well a scan fits at a right one; without them, what is published."""
     from rol_beyond.recovery import measure_level
     from rol_study.route import published_level
-    from rol_study.sampled_points import draw_clouds, look_around
+    from rol_study.sampled_points import find_visible_points, sample_points
 
     if not len(poses):
         return published_level(front_end.share_1m)
-    sight, rng = look_around(map_points, poses), np.random.default_rng(0)
-    return measure_level(draw_clouds(map_points, poses, sight, front_end, rng), poses, grid)
+    sight, rng = find_visible_points(map_points, poses), np.random.default_rng(0)
+    return measure_level(sample_points(map_points, poses, sight, front_end, rng), poses, grid)
 
 
 def _find_parts(map_points: np.ndarray, poses: np.ndarray, front_end: FrontEnd) -> np.ndarray:
     """Find the parts of the kinds of points that have the front end's shares on average over poses."""
-    from rol_study.sampled_points import look_around, measure_kinds, mix_kinds
+    from rol_study.sampled_points import find_visible_points, measure_fractions, solve_mixture
 
-    kinds = measure_kinds(
-        map_points, poses, look_around(map_points, poses), front_end, np.random.default_rng(0)
+    kinds = measure_fractions(
+        map_points, poses, find_visible_points(map_points, poses), front_end, np.random.default_rng(0)
     )
-    return mix_kinds(kinds, front_end.share_1m, front_end.share_2m)
+    return solve_mixture(kinds, front_end.share_1m, front_end.share_2m)
 
 
 def draw_session(stage: Stage, seed: int) -> list[np.ndarray]:
@@ -155,10 +155,12 @@ def draw_session(stage: Stage, seed: int) -> list[np.ndarray]:
     clouds : list of array, shape (m, 2)
         One per scan, in the radar frame [m].
     """
-    from rol_study.sampled_points import draw_clouds
+    from rol_study.sampled_points import sample_points
 
     rng = np.random.default_rng([seed, int(stage.route.number)])
-    drawing = draw_clouds(stage.map_points, stage.route.truth, stage.sight, stage.front_end, rng, stage.parts)
+    drawing = sample_points(
+        stage.map_points, stage.route.truth, stage.sight, stage.front_end, rng, stage.parts
+    )
     return list(drawing)
 
 
@@ -243,13 +245,13 @@ def run_from(
     from rol.mcl import settings_for
     from rol_beyond.motion import mover, screen_steps
     from rol_beyond.recovery import RecoverySettings, localize_with_recovery
-    from rol_study.sampled_points import Sight, draw_clouds
+    from rol_study.sampled_points import VisiblePoints, sample_points
 
     _check_first(stage, first)
     poses, rng = stage.route.truth[first : first + n_scans], np.random.default_rng([seed, first])
     starts = stage.sight.starts[first : first + len(poses) + 1]
-    sight = Sight(stage.sight.points[starts[0] : starts[-1]], starts - starts[0])
-    drawing = draw_clouds(stage.map_points, poses, sight, stage.front_end, rng, stage.parts)
+    sight = VisiblePoints(stage.sight.points[starts[0] : starts[-1]], starts - starts[0])
+    drawing = sample_points(stage.map_points, poses, sight, stage.front_end, rng, stage.parts)
     updates, clouds, n_found = [], [], 0
 
     def keep_clouds() -> Iterator[np.ndarray]:

@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial import cKDTree
 
 from rol.evaluation import pose_errors, rmse
-from rol.geometry import accumulate_steps, compose, invert, relative_pose, transform_points
+from rol.geometry import accumulate_increments, compose, invert, relative_pose, transform_points
 from rol.odometry import (
     LocalMapSettings,
     OdometryError,
@@ -180,7 +180,7 @@ def test_too_few_iterations_are_flagged():
 def test_chain_follows_steps_too_long_for_a_guess_of_zero():
     # at 4 m a scan the nearest post is the wrong one; the guess of constant velocity finds the right one
     steps = np.tile((1.0, 0.0, 0.02), (12, 1)) * np.linspace(0.5, 4.0, 12)[:, None]
-    poses, world = accumulate_steps(steps), posts()
+    poses, world = accumulate_increments(steps), posts()
     clouds = [transform_points(invert(pose), world) for pose in poses]
     found = steps_of(chain(clouds))
     np.testing.assert_allclose(found, steps, atol=0.01)
@@ -188,7 +188,7 @@ def test_chain_follows_steps_too_long_for_a_guess_of_zero():
 
 
 def test_chain_goes_on_through_an_empty_cloud():
-    world, poses = posts(), accumulate_steps(np.tile((0.5, 0.0, 0.0), (4, 1)))
+    world, poses = posts(), accumulate_increments(np.tile((0.5, 0.0, 0.0), (4, 1)))
     clouds = [transform_points(invert(pose), world) for pose in poses]
     clouds[2] = np.zeros((0, 2))
     results = list(chain(clouds))
@@ -376,7 +376,7 @@ class Drive:
         speed = 6.0 - 6.0 * np.cos(2.0 * np.pi * self.seconds / 14.0)  # 0 to 12 m/s
         self.velocity = np.column_stack([speed, 0.02 * speed * np.sin(self.seconds)])
         steps = np.column_stack([speed * 1e-3, np.zeros_like(speed), self.velocity[:, 1] * 1e-3])
-        self.poses = accumulate_steps(steps[:-1])
+        self.poses = accumulate_increments(steps[:-1])
         self.mid_s = 0.2 + first_s + SCAN_SECONDS * np.arange(n_scans)
         self.stamps_us = np.round(self.mid_s * 1e6).astype(np.int64)
         self.truth = self.at(self.mid_s)
@@ -412,7 +412,7 @@ class Drive:
 
     def end_error(self, steps: np.ndarray) -> float:
         """How far the end is from the true one [m]."""
-        end = accumulate_steps(steps, self.truth[0])[-1]
+        end = accumulate_increments(steps, self.truth[0])[-1]
         return float(np.hypot(*(end - self.truth[-1])[:2]))
 
 

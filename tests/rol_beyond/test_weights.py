@@ -47,8 +47,8 @@ def test_the_best_network_beats_raw_peaks_on_real_scans_as_its_card_says(real_ro
     translator, tree = load_network(path), cKDTree(rall.load_map_points(real_root / rall.MAP_PATH))
     rows = []
     for scan in rall.load_scans(real_root)[::3]:
-        fake = translate_scan(translator, scan.codes, scan.azimuths, scan.twist)[0]
-        raw = detect_points(scan.codes, scan.azimuths, scan.twist)
+        fake = translate_scan(translator, scan.power, scan.azimuths, scan.twist)[0]
+        raw = detect_points(scan.power, scan.azimuths, scan.twist)
         rows.append([judge_on_map(points, scan.pose, tree)["share_1m"] for points in (fake, raw)])
         assert len(fake) >= 300
     fake_share, raw_share = np.mean(rows, axis=0)

@@ -9,6 +9,10 @@ import numpy as np
 import pytest
 
 import rol
+import rol_beyond
+import rol_data
+import rol_sim
+import rol_study
 from rol.evaluation import EvaluationError, FailureRule
 from rol.geometry import check_fields
 from rol.mcl import MclError, MclSettings, settings_for
@@ -18,7 +22,7 @@ from rol_beyond.motion import MotionModel
 from rol_beyond.recovery import RecoverySettings
 from rol_sim.sensors.radar import RadarSettings
 from rol_sim.session.settings import SessionSettings, SettingsError, SimulationSettings
-from rol_study.sampled_points import FrontEnd, MapPointsError
+from rol_study.sampled_points import FrontEnd, SampledPointsError
 
 NEEDED = {
     "RecoverySettings": {"level": 0.2},
@@ -29,10 +33,11 @@ NAMES = ("Settings", "Config", "Rule", "Model", "FrontEnd", "Surface")
 
 
 def settings_classes() -> list[type]:
-    """All dataclasses of the package that hold settings."""
+    """All dataclasses of the packages that hold settings."""
     modules = [
         importlib.import_module(found.name)
-        for found in pkgutil.walk_packages(rol.__path__, "rol.")
+        for package in (rol, rol_beyond, rol_data, rol_sim, rol_study)
+        for found in pkgutil.walk_packages(package.__path__, f"{package.__name__}.")
         if not found.name.endswith("__main__")
     ]
     classes = {one for module in modules for one in vars(module).values() if is_dataclass(one)}
@@ -97,7 +102,7 @@ def test_the_classes_are_all_there() -> None:
         (TrainConfig, {"beta1": 1.0}, Pix2PixError, "beta1: 1.0 is not in"),
         (TrainConfig, {"network": "vnet"}, Pix2PixError, "network: 'vnet' is none of resnet, unet"),
         (TrainConfig, {"pixel_loss": "l2"}, Pix2PixError, "pixel_loss: 'l2' is none of l1, entropy"),
-        (FrontEnd, {"share_1m": 40.0}, MapPointsError, "share_1m: 40.0 is not in"),
+        (FrontEnd, {"share_1m": 40.0}, SampledPointsError, "share_1m: 40.0 is not in"),
         (RadarSettings, {"layer_widths_deg": (0.8, 0.0)}, ValueError, "layer_widths_deg: .* is not in"),
         (SimulationSettings, {"loop_m": 10.0}, SettingsError, r"loop_m: 10.0 is not in \[450, inf\)"),
         (SessionSettings, {"changed_share": 0.4}, SettingsError, r"changed_share: 0.4 is not in \[0, 0.3\]"),

@@ -12,6 +12,7 @@ import numpy as np
 
 from rol.compiled import compiled
 from rol.geometry import check_fields
+from rol_sim.world.mesh import Material
 
 CELL = 0.5  # grain of the world along a surface [m]: what a brick pier, a drain pipe, a window frame take up
 MOST_CELLS = 12  # cells that may answer between two neighbouring rays
@@ -97,8 +98,6 @@ def surface_table(changed: dict[str, Surface]) -> np.ndarray:
     table : array, shape (256, 8), float32
         The fields of `Surface` in order; the lobe in [rad].
     """
-    from rol_sim.world.mesh import Material
-
     table = np.zeros((256, 8), dtype=np.float32)
     for material in Material:
         s = {**SURFACES, **changed}.get(material.name, OTHER_SURFACE)
@@ -121,7 +120,7 @@ def scatter(
     is_direct,
     spacing,
     haze,
-    haze_length,
+    clutter_tail_m,
 ):  # pragma: no cover (compiled)
     """Turn hits into echoes; between rays that hit a wall farther apart than a cell, every cell answers.
 
@@ -141,7 +140,7 @@ def scatter(
         False for rays that were mirrored.
     spacing : float
         Angle between neighbouring rays [rad].
-    haze, haze_length : float
+    haze, clutter_tail_m : float
         Share of power, and mean length [m], of the later echoes that follow a surface.
 
     Returns
@@ -193,7 +192,7 @@ def scatter(
             n_later = min(MOST_LATER, 1 + int(together * haze / LATER_POWER))
             for k in range(n_later):
                 turns[count] = 0.06 * (_hash_unit(number, middle, z, 7 + 3 * k) - 0.5)
-                ranges[count] = totals[i] + haze_length * _hash_exponential(number, middle, z, 8 + 3 * k)
+                ranges[count] = totals[i] + clutter_tail_m * _hash_exponential(number, middle, z, 8 + 3 * k)
                 later = together * haze / n_later * _hash_exponential(number, middle, z, 9 + 3 * k) ** 3 / 6.0
                 powers[count], sources[count] = later, i
                 count += 1
