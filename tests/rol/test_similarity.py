@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from rol.similarity import distance_histogram, nn_distances, fraction_within, similarity_summary
+from rol.similarity import distance_histogram, fraction_within, nn_distances, similarity_summary
 
 FAKE = np.array([[0.0, 0.0], [3.0, 0.0], [10.0, 0.0]])
 REAL = np.array([[0.0, 0.5], [3.0, 1.5]])
