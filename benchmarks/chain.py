@@ -29,10 +29,10 @@ from translator import ROOT, describe_machine
 import rol_beyond.unet  # noqa: F401 (registers the architecture)
 from rol import mcl
 from rol.files import write_text
-from rol.odometry import local_map_odometry
 from rol.oxford import load_radar, load_timestamps
 from rol.pix2pix import ResnetGenerator, TrainedNetwork, has_bf16, load_network
 from rol_beyond.front_ends import detect_points, translate_scan
+from rol_beyond.local_map_odometry import local_map_odometry
 from rol_beyond.motion import MotionModel, mover
 from rol_book.parameters import positive
 from rol_data import rall

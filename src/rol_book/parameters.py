@@ -32,7 +32,7 @@ CHOICES: dict[str, tuple[Any, ...]] = {  # parameter -> all its values
     "bf16": ("auto", True, False),
     "device": ("cpu", "cuda"),
     "measurement": ("statistical", "rendered"),
-    "method": ("paper", "rol"),
+    "method": ("paper", "robust"),
     "motion": ("none", "corrected"),
     "points_source": ("raw", "fake", "real", "fake-corrected"),
 }

@@ -7,7 +7,7 @@ from rol.evaluation import FailureWatch, pose_errors, rmse, summarize
 from rol.geometry import accumulate_increments, compose, relative_pose
 from rol.maps import accumulate_map, register_maps
 from rol.mcl import build_grid, localize, settings_for
-from rol.odometry import chain, steps_of
+from rol.odometry import scan_to_scan_icp, stack_increments
 
 SCAN_US = 250_000
 
@@ -78,7 +78,7 @@ def test_ground_truth_from_two_maps_finds_the_offset_of_the_starts(town):
 @pytest.mark.parametrize("method", ["paper", "rol"])
 def test_filter_follows_the_second_drive_on_the_map_of_the_first(town, method):
     truth, clouds = town["second"], town["second_clouds"]
-    steps = steps_of(chain(clouds))
+    steps = stack_increments(scan_to_scan_icp(clouds))
     settings = settings_for(method, n_particles=300)
     grid = build_grid(accumulate_map(town["first_clouds"], town["first"]), settings)
     watch = FailureWatch(np.arange(len(truth)) * SCAN_US, truth)
