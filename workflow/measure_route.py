@@ -188,7 +188,7 @@ def measure_rendered(real_root: str, number: str, first: int, n_scans: int, seed
 
     torch.set_num_threads(1)
     experiment = experiment_of(real_root, number, (0.80, 0.88))
-    translator = load_network(ROOT / "data" / "weights" / "rol.safetensors")
+    translator = load_network(ROOT / "data" / "weights" / "unet.safetensors")
     clouds = list(render_points(real_root, number, first, n_scans, translator, seed))
     truth, increments = (
         experiment.session.truth[first : first + n_scans],

@@ -22,7 +22,7 @@ except ImportError:  # this file was copied on its own
     from files import prepare_images, read_text, write_bytes, write_text
 
 if TYPE_CHECKING:
-    from .pix2pix import ResnetGenerator
+    from .pix2pix import Generator
 
 
 def prepare_fakes(folder: str | Path, settings: dict[str, Any]) -> set[int]:
@@ -107,7 +107,7 @@ def translate_session(
 
 
 def write_fakes(
-    generator: ResnetGenerator,
+    generator: Generator,
     pairs: str | Path,
     folder: str | Path,
     stamps_us: Sequence[int],
@@ -118,7 +118,7 @@ def write_fakes(
 
     Parameters
     ----------
-    generator : ResnetGenerator
+    generator : Generator
         The trained network.
     pairs : path
         Folder of the pairs of the session; only its radar images are read.

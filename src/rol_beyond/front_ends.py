@@ -189,11 +189,11 @@ def judge_on_map(points: np.ndarray, T_map_radar: np.ndarray, map_tree: cKDTree)
     since the map was made, counts as wrong here.
     """
     from rol.geometry import transform_points
-    from rol.similarity import share_within
+    from rol.similarity import fraction_within
 
     distances = map_tree.query(transform_points(T_map_radar, points))[0] if len(points) else np.zeros(0)
     return {
         "n": len(points),
-        "share_1m": share_within(distances, 1.0),
-        "share_2m": share_within(distances, 2.0),
+        "share_1m": fraction_within(distances, 1.0),
+        "share_2m": fraction_within(distances, 2.0),
     }

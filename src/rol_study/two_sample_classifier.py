@@ -13,6 +13,8 @@ from itertools import pairwise
 import numpy as np
 from scipy.stats import rankdata
 
+from rol.radar import MEASURED
+
 ROWS, BINS = 16, 64  # size of a patch
 
 
