@@ -1,9 +1,9 @@
-"""Measure the filter on the real route over many seeds, settings and lost starts: hours of filtering, kept as tables.
+"""Measure the filters on the real route over many seeds, settings and wrong starts: tables of hours of filtering.
 
 python workflow/measure_route.py [--real-root DIR] [--jobs 2] [--only seeds,settings,...]
 
-Writes data/ablations/route_<what>.csv row by row: a run that was stopped goes on where it ended. Chapter 09 reads these
-tables, and makes one run of each session itself.
+Writes data/ablations/route_<what>.csv row by row; a run that was stopped continues where it ended. The chapter on the
+Oxford route reads these tables, and makes one run of each session itself.
 """
 
 from __future__ import annotations
@@ -19,22 +19,25 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from rol.evaluation import consistency, pose_errors, summarize
+from rol.evaluation import pose_errors, summarize
 from rol.files import write_text
-from rol.mcl import MclSettings, settings_for
+from rol.mcl import MclSettings, Measurement
+from rol_beyond.consistency import consistency
 from rol_beyond.motion import MotionModel
-from rol_beyond.recovery import RecoverySettings
+from rol_beyond.recovery import DetectionSettings, RecoverySettings
+from rol_beyond.robust import settings_for
 from rol_book.parameters import positive
 from rol_data.rall import find_real_root
-from rol_study.route import Route, RouteRun, list_routes
-from rol_study.route_runs import (
-    Stage,
+from rol_study.oxford_route import RouteSession, list_sessions
+from rol_study.route_experiments import (
+    FilterRun,
+    RouteExperiment,
     add_outliers,
-    draw_session,
     kidnap,
+    localize_globally,
+    prepare_experiment,
     run_method,
-    set_stage,
-    start_anywhere,
+    sample_session,
 )
 from rol_study.sampled_points import FrontEnd
 
@@ -48,41 +51,42 @@ SETTINGS = {
     "noise": [("noise", value) for value in (0.2, 0.5, 1.0, 2.0)],
 }
 INGREDIENTS = {
-    "all of rol": {},
-    "all places of the map alike": {"crowd_m": 0.0},
-    "a hard threshold": {"likelihood": "count", "crowd_m": 0.0},
-    "plain resampling after each scan": {"resampling": "multinomial", "resample_below": 1.0},
+    "all of robust": {},
+    "all places of the map alike": {"density_radius_m": 0.0},
+    "a hard threshold": {"measurement": Measurement(cell_m=0.25)},
+    "plain resampling after each scan": {"scheme": "multinomial", "ess_fraction": 1.0},
     "lambda of 60": {"exponent": 60.0},
 }
-UNTAUGHT = "motion as measured, not learnt"
-WATCHES = {  # ingredients that are no settings of the filter itself
-    "without recovery": {"doubt": -np.inf, "lost": -np.inf},
-    "standing scans count in full": {"still_share": 1.0},
+UNCALIBRATED = "motion as measured, not learnt"
+# Ingredients that are no settings of the filter itself.
+RECOVERIES = {
+    "without recovery": {"detection": DetectionSettings(search_below=-np.inf, lost_below=-np.inf)},
+    "standing scans count in full": {"stationary_weight": 1.0},
 }
-INGREDIENTS |= {name: {} for name in (*WATCHES, UNTAUGHT)}
+INGREDIENTS |= {name: {} for name in (*RECOVERIES, UNCALIBRATED)}
 NARROW = {"d_th_m": 0.25}
-QUIET = {"noise_forward_m": 0.1, "noise_side_m": 0.06, "noise_yaw_rad": 0.2 * DEG}
+QUIET = {"forward_m": 0.1, "left_m": 0.06, "yaw_rad": 0.2 * DEG}
 TUNED = {"both": NARROW | QUIET, "d_th of 0.25 m": NARROW, "a fifth of the noise": QUIET}
 FRONTS = ((0.40, 0.60), (0.50, 0.70), (0.65, 0.80), (0.80, 0.90))
 
 
 @lru_cache(maxsize=1)
-def stage_of(
+def experiment_of(
     real_root: str,
     number: str,
     shares: tuple[float, float] = (0.40, 0.60),
     max_scans: int = 0,
     settings: MclSettings | None = None,
-) -> Stage:
-    """Set the stage once per worker and session."""
-    return set_stage(real_root, number, FrontEnd(*shares), max_scans=max_scans, settings=settings)
+) -> RouteExperiment:
+    """Prepare the experiment once per worker and session."""
+    return prepare_experiment(real_root, number, FrontEnd(*shares), max_scans=max_scans, settings=settings)
 
 
-def row_of(stage: Stage, run: RouteRun, method: str, seed: int) -> dict:
-    """Figures of merit of one run."""
-    truth, errors = stage.route.truth, pose_errors(run.poses, stage.route.truth)
+def row_of(experiment: RouteExperiment, run: FilterRun, method: str, seed: int) -> dict:
+    """Compute the metrics of one run."""
+    truth, errors = experiment.session.truth, pose_errors(run.poses, experiment.session.truth)
     row = summarize(
-        run.poses, truth, method=method, session=stage.route.number, failures=len(run.failures),
+        run.poses, truth, method=method, session=experiment.session.number, failures=len(run.failures),
         update_ms_median=float(np.median(run.update_ms)), seed=seed,
     )  # fmt: skip
     return row | {
@@ -96,78 +100,82 @@ def row_of(stage: Stage, run: RouteRun, method: str, seed: int) -> dict:
 
 
 def measure(real_root: str, what: str, key: tuple) -> list[dict]:
-    """Make one job; give its rows, each with the job's key."""
+    """Run one job; return its rows, each with the job's key."""
     rows = MEASURES[what](real_root, *key)
     return [{"job": " ".join(map(str, key)), **row} for row in rows]
 
 
 def measure_seeds(real_root: str, number: str, seed: int) -> list[dict]:
-    """Both methods over a whole session."""
-    stage = stage_of(real_root, number)
-    clouds = draw_session(stage, seed)
+    """Run both methods over a whole session."""
+    experiment = experiment_of(real_root, number)
+    clouds = sample_session(experiment, seed)
     return [
-        row_of(stage, run_method(stage, method, clouds, seed), method, seed) for method in ("paper", "rol")
+        row_of(experiment, run_method(experiment, method, clouds, seed), method, seed)
+        for method in ("paper", "robust")
     ]
 
 
 def measure_settings(real_root: str, number: str, seed: int) -> list[dict]:
-    """The method `paper` with one setting after the other changed."""
-    stage, rows = stage_of(real_root, number, (0.40, 0.60), SHORT), []
-    clouds = draw_session(stage, seed)
+    """Run the method `paper` with one setting after the other changed."""
+    experiment, rows = experiment_of(real_root, number, (0.40, 0.60), SHORT), []
+    clouds = sample_session(experiment, seed)
     for name, values in SETTINGS.items():
         for setting, value in values:
-            noise = {
-                "noise_forward_m": 0.5 * value,
-                "noise_side_m": 0.3 * value,
-                "noise_yaw_rad": value * DEG,
-            }
-            run = run_method(
-                stage, "paper", clouds, seed, **(noise if setting == "noise" else {setting: value})
-            )
-            rows.append({"what": name, "value": value, **row_of(stage, run, "paper", seed)})
+            changes = {setting: value}
+            if setting == "noise":
+                changes = {"forward_m": 0.5 * value, "left_m": 0.3 * value, "yaw_rad": value * DEG}
+            run = run_method(experiment, "paper", clouds, seed, **changes)
+            rows.append({"what": name, "value": value, **row_of(experiment, run, "paper", seed)})
     return rows
 
 
 def measure_ingredients(real_root: str, number: str, without: str, seed: int) -> list[dict]:
-    """The method `rol` over a whole session with one of its ingredients changed."""
+    """Run the method `robust` over a whole session with one of its ingredients changed."""
     changes = INGREDIENTS[without]
-    stage = stage_of(real_root, number, settings=settings_for("rol", **changes))
-    if without == UNTAUGHT:
-        stage = replace(stage, model=MotionModel())
-    recovery = RecoverySettings(stage.level, **WATCHES.get(without, {}))
-    run = run_method(stage, "rol", draw_session(stage, seed), seed, recovery=recovery, **changes)
-    return [{"without": without, **row_of(stage, run, "rol", seed)}]
+    experiment = experiment_of(real_root, number, settings=settings_for("robust", **changes))
+    if without == UNCALIBRATED:
+        experiment = replace(experiment, motion=MotionModel())
+    recovery = RecoverySettings(experiment.reference_contrast, **RECOVERIES.get(without, {}))
+    run = run_method(
+        experiment, "robust", sample_session(experiment, seed), seed, recovery=recovery, **changes
+    )
+    return [{"without": without, **row_of(experiment, run, "robust", seed)}]
 
 
 def measure_tuned(real_root: str, number: str, what: str, seed: int) -> list[dict]:
-    """The method `paper` over a whole session with the settings that were best on the first scans of session 02."""
-    stage = stage_of(real_root, number)
-    run = run_method(stage, "paper", draw_session(stage, seed), seed, **TUNED[what])
-    return [{"what": what, **row_of(stage, run, "tuned", seed)}]
+    """Run the method `paper` over a whole session with the settings that were best on the first scans of session 02."""
+    experiment = experiment_of(real_root, number)
+    run = run_method(experiment, "paper", sample_session(experiment, seed), seed, **TUNED[what])
+    return [{"what": what, **row_of(experiment, run, "tuned", seed)}]
 
 
 def measure_registration(real_root: str, number: str, seed: int) -> list[dict]:
-    """Registration on the map without a filter, over a whole session."""
-    stage = stage_of(real_root, number)
-    run = run_method(stage, "registration", draw_session(stage, seed), seed)
-    return [row_of(stage, run, "registration", seed)]
+    """Run scan-to-map ICP without a filter over a whole session."""
+    experiment = experiment_of(real_root, number)
+    run = run_method(experiment, "registration", sample_session(experiment, seed), seed)
+    return [row_of(experiment, run, "registration", seed)]
 
 
 def measure_fronts(real_root: str, number: str, share_1m: float, share_2m: float, seed: int) -> list[dict]:
-    """Both methods with better and better front ends."""
-    stage = stage_of(real_root, number, (share_1m, share_2m), SHORT)
-    clouds, shares = draw_session(stage, seed), {"share_1m": share_1m, "share_2m": share_2m}
-    return [shares | row_of(stage, run_method(stage, m, clouds, seed), m, seed) for m in ("paper", "rol")]
+    """Run both methods with better and better front ends."""
+    experiment = experiment_of(real_root, number, (share_1m, share_2m), SHORT)
+    clouds, shares = sample_session(experiment, seed), {"share_1m": share_1m, "share_2m": share_2m}
+    return [
+        shares | row_of(experiment, run_method(experiment, m, clouds, seed), m, seed)
+        for m in ("paper", "robust")
+    ]
 
 
 def measure_outliers(real_root: str, number: str, share: float, seed: int) -> list[dict]:
-    """Both methods with steps that are plainly wrong."""
-    stage = stage_of(real_root, number, (0.40, 0.60), SHORT)
-    spoiled = replace(stage, route=add_outliers(stage.route, share, np.random.default_rng(seed)))
-    clouds = draw_session(stage, seed)
+    """Run both methods with outliers in the odometry."""
+    experiment = experiment_of(real_root, number, (0.40, 0.60), SHORT)
+    disturbed = replace(
+        experiment, session=add_outliers(experiment.session, share, np.random.default_rng(seed))
+    )
+    clouds = sample_session(experiment, seed)
     return [
-        {"share": share} | row_of(spoiled, run_method(spoiled, m, clouds, seed), m, seed)
-        for m in ("paper", "rol")
+        {"share": share} | row_of(disturbed, run_method(disturbed, m, clouds, seed), m, seed)
+        for m in ("paper", "robust")
     ]
 
 
@@ -179,20 +187,25 @@ def measure_rendered(real_root: str, number: str, first: int, n_scans: int, seed
     from rol_study.rendered_points import render_points
 
     torch.set_num_threads(1)
-    stage = stage_of(real_root, number, (0.80, 0.88))
-    translator = load_network(ROOT / "data" / "weights" / "rol.safetensors")
+    experiment = experiment_of(real_root, number, (0.80, 0.88))
+    translator = load_network(ROOT / "data" / "weights" / "unet.safetensors")
     clouds = list(render_points(real_root, number, first, n_scans, translator, seed))
-    truth, steps = stage.route.truth[first : first + n_scans], stage.route.steps[first : first + n_scans - 1]
-    part = replace(stage, route=Route(number, truth, steps))
-    return [row_of(part, run_method(part, method, clouds, seed), method, seed) for method in ("paper", "rol")]
+    truth, increments = (
+        experiment.session.truth[first : first + n_scans],
+        experiment.session.increments[first : first + n_scans - 1],
+    )
+    part = replace(experiment, session=RouteSession(number, truth, increments))
+    return [
+        row_of(part, run_method(part, method, clouds, seed), method, seed) for method in ("paper", "robust")
+    ]
 
 
 def measure_trial(what: str):
-    """Give the measure of one lost start."""
+    """Make the measurement of a wrong start."""
 
     def trial(real_root: str, number: str, first: int, seed: int) -> list[dict]:
-        found = {"kidnapped": kidnap, "anywhere": start_anywhere}[what](
-            stage_of(real_root, number), first, seed
+        found = {"kidnapped": kidnap, "anywhere": localize_globally}[what](
+            experiment_of(real_root, number), first, seed
         )[0]
         return [{"session": number, "first": first, "seed": seed, **vars(found)}]
 
@@ -214,10 +227,10 @@ MEASURES = {
 
 
 def list_jobs(real_root: str) -> dict[str, list[tuple]]:
-    """List the jobs of each table. Places of lost starts are drawn once, from all sessions but the mapping one."""
-    numbers, rng = list_routes(real_root), np.random.default_rng(2020)
+    """List the jobs of each table. Wrong starts are drawn once, from all sessions but the mapping one."""
+    numbers, rng = list_sessions(real_root), np.random.default_rng(2020)
     driven = [number for number in numbers if number != "01"] or numbers
-    lengths = {number: len(stage_length(real_root, number)) for number in driven}
+    lengths = {number: len(load_truth(real_root, number)) for number in driven}
 
     def places(n: int, seconds: float) -> list[tuple]:
         picked = [driven[k % len(driven)] for k in range(n)]
@@ -241,20 +254,20 @@ def list_jobs(real_root: str) -> dict[str, list[tuple]]:
 
 
 def list_tuned(numbers: list[str]) -> list[tuple]:
-    """List the jobs with better settings, away from the session that they were chosen on."""
+    """List the jobs with tuned settings, without the session that they were tuned on."""
     judged = [number for number in numbers if number != "02"]
     return [(number, what, seed) for number in judged for what in TUNED for seed in (1, 2, 3)]
 
 
-def stage_length(real_root: str, number: str) -> np.ndarray:
-    """Poses of a session, for their number."""
+def load_truth(real_root: str, number: str) -> np.ndarray:
+    """Read the ground-truth poses of a session."""
     from rol_data.rall import POSES_PATH, load_poses
 
     return load_poses(Path(real_root, POSES_PATH, f"pose_xy_{number}.txt"))
 
 
 def run_table(pool: ProcessPoolExecutor, real_root: str, what: str, jobs: list[tuple]) -> None:
-    """Make the jobs that a table lacks, and write the table anew after each."""
+    """Run the jobs that a table lacks, and write the table after each."""
     path = ROOT / "data" / "ablations" / f"route_{what}.csv"
     table = (
         pd.read_csv(path, dtype={"session": str, "job": str}) if path.is_file() else pd.DataFrame({"job": []})
@@ -274,11 +287,11 @@ def run_table(pool: ProcessPoolExecutor, real_root: str, what: str, jobs: list[t
 
 
 def main() -> None:
-    """Measure what is asked for."""
+    """Measure the requested tables."""
     parser = argparse.ArgumentParser(description="Measure the filter on the real route.")
     parser.add_argument("--real-root", default="", help="folder of the real data")
     parser.add_argument("--jobs", type=positive, default=2, help="processes")
-    parser.add_argument("--only", default=",".join(MEASURES), help="tables to make")
+    parser.add_argument("--only", default=",".join(MEASURES), help="tables to measure")
     given = parser.parse_args()
     if unknown := set(given.only.split(",")) - set(MEASURES):
         parser.error(f"--only: no table {min(unknown)!r}; there are: {', '.join(MEASURES)}")

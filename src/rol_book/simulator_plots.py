@@ -9,12 +9,14 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from rol.radar import MEASURED
+
 STYLES = (
     {"color": "#0072B2", "linestyle": "-"},
     {"color": "#E69F00", "linestyle": "-"},
     {"color": "#009E73", "linestyle": "--"},
 )
-BIN_M, OFFSET_M = 0.0438, -0.31  # as `radar` has them
+BIN_M, OFFSET_M = MEASURED.resolution_m, MEASURED.offset_m
 GREYS = plt.get_cmap("gray_r", 12)  # few levels: noise in fine ones makes large files and shows no more
 
 

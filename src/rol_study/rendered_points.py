@@ -81,7 +81,7 @@ def render_points(
     In memory are the map, one scan, and the world within 180 m of the stretch. What has changed since the map was made is
     drawn for a stretch: another ``first_scan`` or ``n_scans`` is another day.
 
-    The network `rol` learnt on this route, in such a world of seed 21: from scans 0 to 4999 of session 02 but for the
+    The network `unet` was trained on this route, in such a world of seed 21: from scans 0 to 4999 of session 02 but for the
     surroundings of the eleven real scans and of one more place (``sets`` in its card). Clouds from there flatter it.
     """
     session = build_segment(real_root, number, first_scan, n_scans, seed, **changes)
@@ -110,7 +110,7 @@ def build_segment(
 def _translate(session: SimulatedSession, network: TrainedNetwork, **how: Any) -> Iterator[np.ndarray]:
     for index, twist in enumerate(true_twists(session)):
         scan = make_scan(session, index)
-        yield translate_scan(network, scan.codes, scan.azimuths, tuple(twist), **how)[0]
+        yield translate_scan(network, scan.power, scan.azimuths, tuple(twist), **how)[0]
 
 
 def true_twists(session: SimulatedSession) -> np.ndarray:

@@ -13,7 +13,7 @@ from itertools import pairwise
 import numpy as np
 from scipy.stats import rankdata
 
-from rol_study.radar_statistics import MEASURED_RANGE_RESOLUTION
+from rol.radar import MEASURED
 
 ROWS, BINS = 16, 64  # size of a patch
 
@@ -140,9 +140,7 @@ def auc_by_group(
         in the patch. 0.5 where it cannot tell.
     """
     peaks = np.stack([cut_patches(real), cut_patches(simulated)]).max(axis=(-1, -2))
-    range_m = np.broadcast_to(
-        (np.arange(peaks.shape[3]) + 0.5) * BINS * MEASURED_RANGE_RESOLUTION, peaks.shape
-    )
+    range_m = np.broadcast_to((np.arange(peaks.shape[3]) + 0.5) * BINS * MEASURED.resolution_m, peaks.shape)
     found: dict[str, dict[str, float]] = {}
     cases = (
         ("range", range_m, (0, 3, 10, 25, 50, 80, 110, 170)),

@@ -208,7 +208,7 @@ def test_route_session_is_read_back_as_it_was_made(small_root: Path, tmp_path: P
         str(folder / "radar" / f"{stamp}.png"), cv2.IMREAD_GRAYSCALE
     )  # the official rules, by hand
     scan = make_scan(made, 7)
-    np.testing.assert_array_equal(raw[:, 11:], scan.codes)
+    np.testing.assert_array_equal(raw[:, 11:], scan.power)
     np.testing.assert_array_equal(np.ascontiguousarray(raw[:, :8]).view("<i8").ravel(), scan.row_stamps_us)
     np.testing.assert_array_equal(
         np.ascontiguousarray(raw[:, 8:10]).view("<u2").ravel(), 13 + 14 * np.arange(400)

@@ -8,8 +8,8 @@ import pytest
 
 import measure_route
 from rol_beyond.motion import MotionModel
-from rol_study.route import RouteRun, published_motion
-from rol_study.route_runs import Stage
+from rol_study.oxford_route import RouteSession, published_motion
+from rol_study.route_experiments import FilterRun, RouteExperiment
 
 N = 30
 
@@ -18,21 +18,23 @@ N = 30
 def asked(monkeypatch: pytest.MonkeyPatch) -> list[SimpleNamespace]:
     """Note what each run is asked for, and give a run that is right."""
     truth = np.column_stack([np.arange(N), np.zeros((N, 2))])
-    stage = Stage(
-        measure_route.Route("07", truth, np.diff(truth, axis=0)), np.zeros((9, 2)), measure_route.FrontEnd(),
+    experiment = RouteExperiment(
+        RouteSession("07", truth, np.diff(truth, axis=0)), np.zeros((9, 2)), measure_route.FrontEnd(),
         None, None, published_motion(), "01", 0.05, None,
     )  # fmt: skip
     noted = []
 
-    def run(stage, method, clouds, seed, *, recovery=None, **changes) -> RouteRun:
+    def run(experiment, method, clouds, seed, *, recovery=None, **changes) -> FilterRun:
         noted.append(
-            SimpleNamespace(stage=stage, method=method, recovery=recovery, changes=changes, seed=seed)
+            SimpleNamespace(
+                experiment=experiment, method=method, recovery=recovery, changes=changes, seed=seed
+            )
         )
         spread = np.full((N, 3, 3), np.nan) if method == "registration" else np.tile(np.eye(3), (N, 1, 1))
-        return RouteRun(truth, spread, [], np.zeros(N, dtype=bool), np.ones(N), np.full(N, 100), np.ones(N))
+        return FilterRun(truth, spread, [], np.zeros(N, dtype=bool), np.ones(N), np.full(N, 100), np.ones(N))
 
-    monkeypatch.setattr(measure_route, "stage_of", lambda *a, **k: stage)
-    monkeypatch.setattr(measure_route, "draw_session", lambda stage, seed: [])
+    monkeypatch.setattr(measure_route, "experiment_of", lambda *a, **k: experiment)
+    monkeypatch.setattr(measure_route, "sample_session", lambda experiment, seed: [])
     monkeypatch.setattr(measure_route, "run_method", run)
     return noted
 
@@ -44,19 +46,22 @@ def test_each_ingredient_changes_one_thing(asked: list) -> None:
     found = {
         name: (
             made.changes,
-            made.stage.model == published_motion(),
-            np.isfinite(made.recovery.doubt) and np.isfinite(made.recovery.lost),
-            made.recovery.still_share,
+            made.experiment.motion == published_motion(),
+            np.isfinite([made.recovery.detection.search_below, made.recovery.detection.lost_below]).all(),
+            made.recovery.stationary_weight,
         )
         for name, made in zip(measure_route.INGREDIENTS, asked, strict=True)
     }
-    usual = found.pop("all of rol")
-    assert usual == ({}, True, True, 0.25) and {made.recovery.level for made in asked} == {0.05}
+    usual = found.pop("all of robust")
+    assert usual == ({}, True, True, 0.25) and {made.recovery.reference_contrast for made in asked} == {0.05}
     for name, given in found.items():
         assert sum(a != b for a, b in zip(given, usual, strict=True)) == 1, name
     assert not found["without recovery"][2]
     assert found["standing scans count in full"][3] == 1.0
-    assert asked[list(measure_route.INGREDIENTS).index(measure_route.UNTAUGHT)].stage.model == MotionModel()
+    assert (
+        asked[list(measure_route.INGREDIENTS).index(measure_route.UNCALIBRATED)].experiment.motion
+        == MotionModel()
+    )
 
 
 def test_tuned_is_the_paper_with_the_best_of_the_swept_settings(asked: list) -> None:
@@ -68,14 +73,17 @@ def test_tuned_is_the_paper_with_the_best_of_the_swept_settings(asked: list) -> 
     assert narrow == {"d_th_m": min(value for _, value in measure_route.SETTINGS["d_th [m]"])}
     factor = min(value for _, value in measure_route.SETTINGS["noise"])
     usual = measure_route.settings_for("paper")
-    assert quiet == pytest.approx({name: factor * getattr(usual, name) for name in quiet}) and len(quiet) == 3
+    assert (
+        quiet == pytest.approx({name: factor * getattr(usual.motion, name) for name in quiet})
+        and len(quiet) == 3
+    )
 
 
 def test_registration_has_a_row_without_a_covariance(asked: list) -> None:
     (row,) = measure_route.measure_registration("", "07", 1)
     assert asked[0].method == row["method"] == "registration"
     assert row["rmse_m"] == 0.0 and "mean_nees" not in row
-    (other,) = measure_route.measure_ingredients("", "07", "all of rol", 1)
+    (other,) = measure_route.measure_ingredients("", "07", "all of robust", 1)
     assert other["mean_nees"] == 0.0
 
 

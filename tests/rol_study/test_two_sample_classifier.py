@@ -103,9 +103,9 @@ def test_classifier_tells_what_differs_and_nothing_else() -> None:
 def test_twins_have_the_statistics_of_the_real_scans(real_root: Path) -> None:
     """The calibration itself: targets that simulated scans must meet, on a seed that it was not set with."""
     known = rall.load_scan_poses(rall.find_scan_poses(real_root))
-    real = np.stack([load_radar(real_root / rall.SCANS_PATH / "radar" / f"{us}.png").codes for us in known])
+    real = np.stack([load_radar(real_root / rall.SCANS_PATH / "radar" / f"{us}.png").power for us in known])
     twins = build_twins(real_root, seed=11)
-    codes = np.stack([make_scan(twins, i).codes for i in range(len(known))])
+    codes = np.stack([make_scan(twins, i).power for i in range(len(known))])
     ours, theirs = statistics.scan_statistics(codes), statistics.scan_statistics(real)
     assert ours["forbidden"] == 0 and ours["near_copies"]
     assert statistics.hellinger_distance(ours["histogram"], theirs["histogram"]) < 0.1

@@ -166,7 +166,7 @@ def simulate_scan(
     Returns
     -------
     codes : array, shape (400, 3768), uint8
-        Half-dB power codes, as `oxford.save_radar` takes them.
+        Half-dB power codes, as `rol_sim.session.oxford_files.save_radar` takes them.
 
     Raises
     ------

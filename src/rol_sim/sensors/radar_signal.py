@@ -12,9 +12,13 @@ from functools import lru_cache
 import numpy as np
 
 from rol.compiled import compiled
+from rol.radar import MEASURED
 
 N_AZIMUTHS, N_BINS = 400, 3768
-RANGE_RESOLUTION, RANGE_OFFSET = 0.0438, -0.31  # true range = (bin + 0.5) * resolution + offset [m]
+RANGE_RESOLUTION, RANGE_OFFSET = (
+    MEASURED.resolution_m,
+    MEASURED.offset_m,
+)  # true range = (bin + 0.5) * resolution + offset [m]
 
 # A Hann window over the chirp, its spectrum padded: one cell of the bare spectrum is this many bins.
 HANN_BINS = 5.9

@@ -312,7 +312,7 @@ def make_scan(session: SimulatedSession, index: int) -> RadarScan:
     Returns
     -------
     scan : oxford.RadarScan
-        As `oxford.save_radar` takes it.
+        As `rol_sim.session.oxford_files.save_radar` takes it.
     """
     stamp, turn, rng = (
         int(session.scans_us[index]),

@@ -21,11 +21,10 @@ from typing import Any
 import cv2
 import numpy as np
 
-from rol import oxford
 from rol.evaluation import write_tum
 from rol.files import is_used, read_marker, write_bytes, write_text
-from rol.oxford import VelodyneRaw, save_radar, save_velodyne_raw
-from rol_sim.session import logs
+from rol.oxford import RadarOdometry, VelodyneRaw
+from rol_sim.session import logs, oxford_files
 from rol_sim.session.settings import SimulationSettings, describe
 from rol_sim.session.simulation import (
     GPS,
@@ -224,7 +223,7 @@ def _prepare_folder(folder: Path, wanted: dict[str, Any], report: Callable[[str]
 def _write_scan(folder: Path, session: SimulatedSession, index: int) -> None:
     path = folder / "radar" / f"{session.scans_us[index]}.png"
     if not path.exists():
-        save_radar(path, make_scan(session, index))
+        oxford_files.save_radar(path, make_scan(session, index))
 
 
 def _write_sweep(folder: Path, session: SimulatedSession, sensor: str, place: int, index: int) -> None:
@@ -237,19 +236,21 @@ def _write_sweep(folder: Path, session: SimulatedSession, sensor: str, place: in
     sweep = make_sweep(session, sensor, int(index))
     if labels is not None:
         _write_image(labels, sweep.materials)
-    save_velodyne_raw(path, VelodyneRaw(sweep.intensities, sweep.ranges, sweep.angles, sweep.stamps_us))
+    oxford_files.save_velodyne_raw(
+        path, VelodyneRaw(sweep.intensities, sweep.ranges, sweep.angles, sweep.stamps_us)
+    )
 
 
 def _write_logs(folder: Path, session: SimulatedSession) -> None:
     """Everything but scans and sweeps; session.json last."""
     scans, middles, settings = session.scans_us, session.scans_us + session.turns_us // 2, session.settings
-    oxford.save_timestamps(folder / "radar.timestamps", scans)
+    oxford_files.save_timestamps(folder / "radar.timestamps", scans)
     for sensor in LIDARS:
         if len(
             session.chosen[sensor]
         ):  # a session without sweeps looks like one whose lidars were not fetched
             chosen = session.sweeps_us[sensor][session.chosen[sensor]]
-            oxford.save_timestamps(folder / f"{sensor}.timestamps", chosen)
+            oxford_files.save_timestamps(folder / f"{sensor}.timestamps", chosen)
     truth = session.drive.pose(middles)
     steps = np.zeros((len(scans) - 2, 6))  # as in the data set, the last scan has no pose
     steps[:, [0, 1, 5]] = logs.drift_odometry(
@@ -258,12 +259,12 @@ def _write_logs(folder: Path, session: SimulatedSession) -> None:
         scale_spread=settings.odometry_scale,
         yaw_spread_rad=settings.odometry_yaw_rad,
     )
-    oxford.save_radar_odometry(
+    oxford_files.save_radar_odometry(
         folder / "gt" / "radar_odometry.csv",
-        oxford.RadarOdometry(middles[1:-1], middles[:-2], scans[1:-1], scans[:-2], steps),
+        RadarOdometry(middles[1:-1], middles[:-2], scans[1:-1], scans[:-2], steps),
     )
-    oxford.save_gps(folder / "gps" / "gps.csv", logs.draw_gps(session.drive, session.generator(GPS)))
-    oxford.save_ins(folder / "gps" / "ins.csv", logs.draw_ins(session.drive, session.generator(INS)))
+    oxford_files.save_gps(folder / "gps" / "gps.csv", logs.draw_gps(session.drive, session.generator(GPS)))
+    oxford_files.save_ins(folder / "gps" / "ins.csv", logs.draw_ins(session.drive, session.generator(INS)))
     write_tum(folder / "truth.tum", scans, truth)
     _write_json(folder / "session.json", _summarise(session, truth))
 
