@@ -270,9 +270,11 @@ def _answer(surface, cosine, number, cell, z):  # pragma: no cover (compiled)
     """
     aspect = int(np.arccos(min(cosine, 1.0)) / ASPECT)
     diffuse = (
-        surface[0] * max(cosine, 1e-3) ** surface[1]
-        * _hash_exponential(number, cell, z, 3) * _hash_exponential(number, cell + 7919 * aspect, z, 10)
-    )  # fmt: skip
+        surface[0]
+        * max(cosine, 1e-3) ** surface[1]
+        * _hash_exponential(number, cell, z, 3)
+        * _hash_exponential(number, cell + 7919 * aspect, z, 10)
+    )
     specular, corner = 0.0, 0.0
     if surface[2] > 0.0:
         tilt = 0.03 * (_hash_unit(number, cell, z, 1) + _hash_unit(number, cell, z, 2) - 1.0)
