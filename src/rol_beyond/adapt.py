@@ -115,7 +115,7 @@ def adapt(
     steps, batch : int
         Steps of Adam, and pairs a step. Few of both: there is little to learn from.
     learning_rate, occupied_weight : float
-        Of Adam, and of `rol.pix2pix.entropy_loss`.
+        Of Adam, and of `rol_beyond.training_options.bce_loss`.
     threshold : int
         See `draw_real_pair`.
     settings : dict, optional
@@ -135,7 +135,7 @@ def adapt(
     """
     import torch
 
-    from rol.pix2pix import entropy_loss
+    from rol_beyond.training_options import bce_loss
 
     if len(pairs) == 0:
         raise ValueError("no real pairs to adapt to")
@@ -154,7 +154,7 @@ def adapt(
         )
         with torch.autocast(device, torch.bfloat16, enabled=bf16):
             logits = adapted.logits(radar)
-        loss = entropy_loss(logits, lidar, occupied_weight)
+        loss = bce_loss(logits, lidar, occupied_weight)
         if not torch.isfinite(loss.detach()):
             raise ValueError(f"step {step + 1} of {steps}: loss is {float(loss.detach())}")
         optimizer.zero_grad(set_to_none=True)
