@@ -26,6 +26,7 @@ import torch
 from filter import open_map
 from translator import ROOT, describe_machine
 
+import rol_beyond.unet  # noqa: F401 (registers the architecture)
 from rol import mcl
 from rol.files import write_text
 from rol.oxford import load_radar, load_timestamps
@@ -37,7 +38,7 @@ from rol_beyond.robust import settings_for
 from rol_book.parameters import positive
 from rol_data import rall
 
-NETWORKS = {"network rol, four headings": ("rol", None), "network rol, one heading": ("rol", 1),
+NETWORKS = {"network unet, four headings": ("unet", None), "network unet, one heading": ("unet", 1),
             "network paper, narrow": ("paper", None)}  # fmt: skip
 PERIOD_US = 250_000  # of the radar
 Scan = tuple[np.ndarray, np.ndarray]
@@ -49,23 +50,23 @@ def open_scans(given: str, n_simulated: int = 11) -> tuple[list[Scan], str]:
     root = rall.find_real_root(given)
     if root is not None:
         scans = rall.load_scans(root)
-        return [(scan.codes, scan.azimuths) for scan in scans], f"{len(scans)} real scans"
+        return [(scan.power, scan.azimuths) for scan in scans], f"{len(scans)} real scans"
     folder = ROOT / "data" / "sessions" / "demo" / "sim-town-seq01"
     if not folder.is_dir():
         raise SystemExit(f"{folder}: missing, and no real data at hand; `make book` makes the session")
     stamps_us = load_timestamps(folder / "radar.timestamps")[:n_simulated]
     loaded = [load_radar(folder / "radar" / f"{us}.png") for us in stamps_us]
-    return [(scan.codes, scan.azimuths) for scan in loaded], f"{len(loaded)} simulated scans"
+    return [(scan.power, scan.azimuths) for scan in loaded], f"{len(loaded)} simulated scans"
 
 
 def list_front_ends(full_width: int = 64) -> dict[str, FrontEnd]:
     """Every front end by name; networks multiply in bfloat16 where the processor has instructions for it."""
     ends: dict[str, FrontEnd] = {"raw peaks": detect_points}
     weights = ROOT / "data" / "weights"
-    for words, (name, headings) in NETWORKS.items():
-        ends[words] = translate(load_network(weights / f"{name}.safetensors"), headings)
+    for words, (name, tta_rotations) in NETWORKS.items():
+        ends[words] = translate(load_network(weights / f"{name}.safetensors"), tta_rotations)
     narrow = load_network(weights / "paper.safetensors")
-    full = ResnetGenerator(full_width, blocks=9).eval()
+    full = ResnetGenerator(full_width, n_blocks=9).eval()
     wide = translate(TrainedNetwork(full, narrow.points, narrow.settings, {}), 1)
     ends["network paper, full width"] = lambda codes, azimuths: (
         wide(codes, azimuths),
@@ -74,9 +75,9 @@ def list_front_ends(full_width: int = 64) -> dict[str, FrontEnd]:
     return ends
 
 
-def translate(translator: TrainedNetwork, headings: int | None) -> FrontEnd:
+def translate(network: TrainedNetwork, tta_rotations: int | None) -> FrontEnd:
     """A network as a front end."""
-    made = partial(translate_scan, translator, bf16=has_bf16(), headings=headings)
+    made = partial(translate_scan, network, bf16=has_bf16(), tta_rotations=tta_rotations)
     return lambda codes, azimuths: made(codes, azimuths)[0]
 
 

@@ -46,9 +46,9 @@ from rol.bev import image_to_points
 from rol.evaluation import KITTI_LENGTHS_M, drift_by_length, pose_errors, read_tum, rmse
 from rol.fakes import list_fakes, read_image
 from rol.files import write_text
-from rol.geometry import accumulate_steps, compose, relative_pose, transform_points
+from rol.geometry import accumulate_increments, compose, relative_pose, transform_points
 from rol.odometry import fit_rigid, icp_2d, scan_to_scan_icp
-from rol.radar import KIT_RANGE_RESOLUTION, MEASURED_RANGE_RESOLUTION
+from rol.radar import MEASURED, SDK
 from rol_beyond.local_map_odometry import deskew_cloud, local_map_odometry
 from rol_beyond.scan_matching import correlative_scan_match
 from rol_data import rall
@@ -61,7 +61,7 @@ except ImportError:
 CFEAR_PCT = (
     1.3  # drift of CFEAR-3 from Oxford's raw radar, sessions of its authors' choice (Adolfsson et al. 2023)
 )
-LONGER = MEASURED_RANGE_RESOLUTION / KIT_RANGE_RESOLUTION  # a range bin as measured, beside the kit's
+LONGER = MEASURED.resolution_m / SDK.resolution_m  # length of a range bin as measured over the SDK's
 REAL_SESSIONS = {"01": "2019-01-10-11-46-21", "02": "2019-01-10-12-32-52", "07": "2019-01-11-12-26-55"}
 MAX_DISTANCE_M = 1.0  # of a pair, for the peers: our ICP's last limit; with 2 or 3 m they drift more
 ITERATIONS = 30  # at most, for all
@@ -211,7 +211,7 @@ def take_turns(ways: dict[str, Steps], n_steps: int) -> tuple[dict[str, np.ndarr
 def judge(steps: np.ndarray, truth: np.ndarray, longest_m: float) -> dict[str, float]:
     """Drift over stretches up to a length, and the errors of single steps."""
     lengths_m = tuple(length for length in KITTI_LENGTHS_M if length <= longest_m)
-    report = drift_by_length(accumulate_steps(steps), truth, lengths_m)
+    report = drift_by_length(accumulate_increments(steps), truth, lengths_m)
     errors = pose_errors(steps, relative_pose(truth[:-1], truth[1:]))
     return {
         "drift [%]": report.mean_translation_pct,

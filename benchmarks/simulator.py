@@ -17,14 +17,15 @@ from time import perf_counter
 
 import numpy as np
 
-from rol import oxford
 from rol.files import write_text
+from rol.oxford import VelodyneRaw
 from rol_book.parameters import positive
 from rol_data import rall
 from rol_sim.sensors import radar as radar_sensor
 from rol_sim.sensors import radar_signal
-from rol_sim.session.assembly import SimulatedSession, build_session, make_scan, make_sweep, sensor_settings
+from rol_sim.session import oxford_files
 from rol_sim.session.settings import load_settings
+from rol_sim.session.simulation import SimulatedSession, build_session, make_scan, make_sweep, sensor_settings
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -56,9 +57,9 @@ def time_scan(session: SimulatedSession, index: int, folder: Path) -> dict[str, 
     scan = make_scan(session, index)
     whole = perf_counter() - marks[-1]
     begin = perf_counter()
-    oxford.save_radar(folder / f"{scan.stamp_us}.png", scan)
+    oxford_files.save_radar(folder / f"{scan.stamp_us}.png", scan)
     written = perf_counter() - begin
-    assert codes.shape == scan.codes.shape
+    assert codes.shape == scan.power.shape
     names = ("traffic", "rays sent", "rays traced", "signal")
     parts = dict(zip(names, np.diff(marks), strict=True))
     found = {**parts, "file written": written, "whole scan": whole + written, "echoes": len(rows) / 1000.0}
@@ -70,8 +71,8 @@ def time_sweep(session: SimulatedSession, index: int, folder: Path) -> dict[str,
     begin = perf_counter()
     sweep = make_sweep(session, "velodyne_left", index)
     made = perf_counter()
-    raw = oxford.VelodyneRaw(sweep.intensities, sweep.ranges, sweep.angles, sweep.stamps_us)
-    oxford.save_velodyne_raw(folder / "sweep.png", raw)
+    raw = VelodyneRaw(sweep.intensities, sweep.ranges, sweep.angles, sweep.stamps_us)
+    oxford_files.save_velodyne_raw(folder / "sweep.png", raw)
     return {"sweep": 1000.0 * (made - begin), "sweep written": 1000.0 * (perf_counter() - made)}
 
 

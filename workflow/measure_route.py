@@ -184,12 +184,12 @@ def measure_rendered(real_root: str, number: str, first: int, n_scans: int, seed
     import torch
 
     from rol.pix2pix import load_network
-    from rol_study.rendered_points import render_clouds
+    from rol_study.rendered_points import render_points
 
     torch.set_num_threads(1)
     experiment = experiment_of(real_root, number, (0.80, 0.88))
-    translator = load_network(ROOT / "data" / "weights" / "rol.safetensors")
-    clouds = list(render_clouds(real_root, number, first, n_scans, translator, seed))
+    translator = load_network(ROOT / "data" / "weights" / "unet.safetensors")
+    clouds = list(render_points(real_root, number, first, n_scans, translator, seed))
     truth, increments = (
         experiment.session.truth[first : first + n_scans],
         experiment.session.increments[first : first + n_scans - 1],

@@ -129,7 +129,7 @@ class FailureRule:
     """
 
     max_position_m: float = 20.0
-    max_yaw_rad: float = np.deg2rad(45.0)
+    max_yaw_rad: float = float(np.deg2rad(45.0))
     seconds: float = 5.0
 
     def __post_init__(self) -> None:

@@ -22,7 +22,7 @@ except ImportError:  # this file was copied on its own
     from files import prepare_images, read_text, write_bytes, write_text
 
 if TYPE_CHECKING:
-    from .pix2pix import ResnetGenerator
+    from .pix2pix import Generator
 
 
 def prepare_fakes(folder: str | Path, settings: dict[str, Any]) -> set[int]:
@@ -107,7 +107,7 @@ def translate_session(
 
 
 def write_fakes(
-    generator: ResnetGenerator,
+    generator: Generator,
     pairs: str | Path,
     folder: str | Path,
     stamps_us: Sequence[int],
@@ -118,7 +118,7 @@ def write_fakes(
 
     Parameters
     ----------
-    generator : ResnetGenerator
+    generator : Generator
         The trained network.
     pairs : path
         Folder of the pairs of the session; only its radar images are read.
@@ -227,7 +227,7 @@ def read_points(
         If the folder is not complete or an image cannot be read; the message names the file.
     """
     from .bev import image_to_points
-    from .radar import compensate_points
+    from .radar import ScanMotion, compensate_points
 
     folder = Path(folder)
     how = list_fakes(folder)[1]
@@ -236,7 +236,7 @@ def read_points(
         twists = [None] * len(stamps_us)
     for stamp, twist in zip(stamps_us, twists, strict=True):
         points = image_to_points(read_image(folder / f"{int(stamp)}.png"), **how)
-        yield points if twist is None else compensate_points(points, twist)
+        yield points if twist is None else compensate_points(points, ScanMotion(twist))
 
 
 def read_image(path: str | Path) -> np.ndarray:

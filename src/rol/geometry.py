@@ -212,7 +212,7 @@ def check_grid(
 
 
 def compose(T_a_b: np.ndarray, T_b_c: np.ndarray) -> np.ndarray:
-    """Chain two poses: the pose of c in a.
+    """Compose two poses: the pose of c in a.
 
     Parameters
     ----------
@@ -222,7 +222,7 @@ def compose(T_a_b: np.ndarray, T_b_c: np.ndarray) -> np.ndarray:
     Returns
     -------
     T_a_c : array, shape (..., 3)
-        The chained pose, yaw in [-pi, pi).
+        The composed pose, yaw in [-pi, pi).
     """
     a, b = np.asarray(T_a_b, dtype=np.float64), np.asarray(T_b_c, dtype=np.float64)
     c, s = np.cos(a[..., 2]), np.sin(a[..., 2])
@@ -252,7 +252,7 @@ def invert(T_a_b: np.ndarray) -> np.ndarray:
 
 
 def relative_pose(T_w_a: np.ndarray, T_w_b: np.ndarray) -> np.ndarray:
-    """Give the pose of b as seen from a.
+    """Compute the pose of b in the frame of a.
 
     Parameters
     ----------
@@ -311,15 +311,15 @@ def log(poses: np.ndarray) -> np.ndarray:
     return np.stack([vx, vy, yaw], axis=-1)
 
 
-def accumulate_steps(
-    steps: np.ndarray, start: np.ndarray | tuple[float, float, float] = (0.0, 0.0, 0.0)
+def accumulate_increments(
+    increments: np.ndarray, start: np.ndarray | tuple[float, float, float] = (0.0, 0.0, 0.0)
 ) -> np.ndarray:
-    """Chain body-frame steps into a trajectory.
+    """Compose odometry increments into a trajectory.
 
     Parameters
     ----------
-    steps : array, shape (n, 3)
-        Step i is the pose of frame i + 1 in frame i (x, y, yaw) [m, m, rad].
+    increments : array, shape (n, 3)
+        Increment i is the pose of frame i + 1 in frame i (x, y, yaw) [m, m, rad].
     start : array-like, shape (3,)
         Pose of frame 0 [m, m, rad].
 
@@ -328,12 +328,13 @@ def accumulate_steps(
     poses : array, shape (n + 1, 3)
         Pose of every frame, the start first; yaw in [-pi, pi).
     """
-    steps = check_poses(np.asarray(steps, dtype=np.float64).reshape(-1, 3), "steps")
+    increments = check_poses(np.asarray(increments, dtype=np.float64).reshape(-1, 3), "increments")
     x0, y0, yaw0 = check_poses(start, "start")
-    yaws = yaw0 + np.concatenate([[0.0], np.cumsum(steps[:, 2])])
+    yaws = yaw0 + np.concatenate([[0.0], np.cumsum(increments[:, 2])])
     c, s = np.cos(yaws[:-1]), np.sin(yaws[:-1])
-    x = x0 + np.concatenate([[0.0], np.cumsum(c * steps[:, 0] - s * steps[:, 1])])
-    y = y0 + np.concatenate([[0.0], np.cumsum(s * steps[:, 0] + c * steps[:, 1])])
+    dx, dy = increments[:, 0], increments[:, 1]
+    x = x0 + np.concatenate([[0.0], np.cumsum(c * dx - s * dy)])
+    y = y0 + np.concatenate([[0.0], np.cumsum(s * dx + c * dy)])
     return np.stack([x, y, wrap_angle(yaws)], axis=-1)
 
 
@@ -358,7 +359,7 @@ def transform_points(T_a_b: np.ndarray, points: np.ndarray) -> np.ndarray:
 
 
 def first_of_cells(points: np.ndarray, cell: float) -> np.ndarray:
-    """Keep one point of each square cell: what was seen again and again from one place counts once.
+    """Keep one point per square cell, so that a place observed many times counts once.
 
     Parameters
     ----------

@@ -48,7 +48,7 @@ class MotionNoise:
 
     forward_m: float = 0.5
     left_m: float = 0.3
-    yaw_rad: float = np.deg2rad(1.0)
+    yaw_rad: float = float(np.deg2rad(1.0))
     per_m: float = 0.03
     yaw_per_rad: float = 0.03
 
@@ -146,7 +146,7 @@ class MclSettings:
 
     n_particles: int = 500
     start_spread_m: float = 0.5
-    start_spread_yaw_rad: float = np.deg2rad(1.0)
+    start_spread_yaw_rad: float = float(np.deg2rad(1.0))
     motion: MotionNoise = MotionNoise()
     measurement: Measurement = Measurement()
     resampling: Resampling = Resampling()

@@ -92,7 +92,7 @@ def estimate_twists(odometry: Any) -> np.ndarray:
     ValueError
         If there is no step, a step takes no time, or the steps are not one chain.
     """
-    steps = np.asarray(odometry.steps, dtype=np.float64)
+    steps = np.asarray(odometry.increments, dtype=np.float64)
     later, earlier = np.asarray(odometry.source_stamps_us), np.asarray(odometry.destination_stamps_us)
     if len(steps) == 0:
         raise ValueError("odometry: no step to take a velocity from")
@@ -158,7 +158,7 @@ def load_lidar_points(
     """
     from .lidar import relate_sensors, sweep_to_radar
     from .oxford import EXTRINSICS, load_sweep
-    from .radar import undistort_points
+    from .radar import deskew_points
 
     if twist is not None and mid_stamp_us is None:
         raise ValueError("a twist needs mid_stamp_us, the time to move the points to")
@@ -171,7 +171,7 @@ def load_lidar_points(
         points, stamps_us = load_sweep(session, sensor, int(stamp))
         points = sweep_to_radar(points, relate_sensors(EXTRINSICS["radar"], EXTRINSICS[sensor]))
         if twist is not None:
-            points[:, :3] = undistort_points(points[:, :3], (stamps_us - int(mid_stamp_us)) / 1e6, twist)
+            points[:, :3] = deskew_points(points[:, :3], (stamps_us - int(mid_stamp_us)) / 1e6, twist)
         clouds.append(points)
     return np.concatenate(clouds)
 
@@ -227,7 +227,7 @@ def build_pair(
     from .bev import points_to_image
     from .lidar import crop_range, remove_ground
     from .oxford import load_radar
-    from .radar import polar_to_cartesian
+    from .radar import RangeCalibration, ScanMotion, polar_to_cartesian
 
     if motion not in ("none", "corrected"):
         raise ValueError(f"motion must be 'none' or 'corrected', not {motion!r}")
@@ -237,14 +237,12 @@ def build_pair(
     mid_stamp_us = int(radar_stamp) + 125_000 if mid_stamp_us is None else int(mid_stamp_us)
     scan = load_radar(session.radar_path(int(radar_stamp)))
     power = polar_to_cartesian(
-        scan.codes,
+        scan.power,
         scan.azimuths,
-        range_resolution=range_resolution,
-        range_offset=range_offset,
+        calibration=RangeCalibration(range_resolution, range_offset),
         pixel_size=pixel_size,
         width=width,
-        twist=twist,
-        doppler_seconds=doppler_seconds,
+        motion=None if twist is None else ScanMotion(twist, doppler_seconds=doppler_seconds),
     )
     points = load_lidar_points(session, left_stamp, right_stamp, mid_stamp_us=mid_stamp_us, twist=twist)
     points = crop_range(remove_ground(points, min_height), max_range)

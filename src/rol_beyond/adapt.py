@@ -75,7 +75,7 @@ def draw_real_pair(
     from rol_beyond.scan_pairs import turned_radar_image
 
     radar = turned_radar_image(
-        pair.codes, pair.azimuths, turn, (0.0, 0.0, 0.0), {**settings, "motion": "none"}
+        pair.power, pair.azimuths, turn, (0.0, 0.0, 0.0), {**settings, "motion": "none"}
     )
     c, s = np.cos(turn), np.sin(turn)
     size, width = settings.get("pixel_size", 0.25), len(radar)

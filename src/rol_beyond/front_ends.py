@@ -106,7 +106,7 @@ def detect_points(
     range_resolution, range_offset : float, optional
         Length of a bin and shift of all ranges [m]; those measured for Oxford's radar if not given.
     **settings
-        More for `rol.radar.find_peaks` (``k``, ``min_code``) or `rol.radar.cfar_peaks`.
+        More for `rol.radar.find_peaks` (``k``, ``min_code``) or `rol_beyond.detectors.cfar_peaks`.
 
     Returns
     -------
@@ -119,21 +119,22 @@ def detect_points(
         If there is no such detector, or the scan is refused by `rol.radar.check_scan`.
     """
     from rol import radar
+    from rol_beyond.detectors import cfar_peaks
 
     codes, azimuths = radar.check_scan(codes, azimuths)
-    resolution = radar.MEASURED_RANGE_RESOLUTION if range_resolution is None else range_resolution
-    offset = radar.MEASURED_RANGE_OFFSET if range_offset is None else range_offset
+    resolution = radar.MEASURED.resolution_m if range_resolution is None else range_resolution
+    offset = radar.MEASURED.offset_m if range_offset is None else range_offset
     min_bin = max(int(np.ceil((min_range_m - offset) / resolution - 0.5)), 0)
     if detector == "k-strongest":
         kept = {"k": K_STRONGEST, "min_code": MIN_CODE, **settings}
         rows, bins = radar.find_peaks(codes, kept["k"], kept["min_code"], min_bin)
     elif detector == "cfar":
-        rows, bins = radar.cfar_peaks(codes, min_bin=min_bin, **settings)
+        rows, bins = cfar_peaks(codes, min_bin=min_bin, **settings)
     else:
         raise ValueError(f"detector: {detector!r} is none of {', '.join(DETECTORS)}")
     return radar.peaks_to_points(
-        rows, bins, azimuths, max_range_m=max_range_m, range_resolution=resolution, range_offset=offset,
-        twist=twist, doppler_seconds=radar.DOPPLER_SECONDS,
+        rows, bins, azimuths, max_range_m=max_range_m, calibration=radar.RangeCalibration(resolution, offset),
+        motion=None if twist is None else radar.ScanMotion(twist),
     )  # fmt: skip
 
 
@@ -188,11 +189,11 @@ def judge_on_map(points: np.ndarray, T_map_radar: np.ndarray, map_tree: cKDTree)
     since the map was made, counts as wrong here.
     """
     from rol.geometry import transform_points
-    from rol.similarity import share_within
+    from rol.similarity import fraction_within
 
     distances = map_tree.query(transform_points(T_map_radar, points))[0] if len(points) else np.zeros(0)
     return {
         "n": len(points),
-        "share_1m": share_within(distances, 1.0),
-        "share_2m": share_within(distances, 2.0),
+        "share_1m": fraction_within(distances, 1.0),
+        "share_2m": fraction_within(distances, 2.0),
     }

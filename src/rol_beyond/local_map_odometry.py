@@ -258,7 +258,7 @@ def deskew_cloud(
     bearings, ranges = np.arctan2(points[:, 1], points[:, 0]), np.hypot(points[:, 0], points[:, 1])
     nearer = radar.doppler_shift(bearings, twist, doppler) / np.maximum(ranges, 1e-9)
     seconds = (np.mod(-bearings, 2.0 * np.pi) / (2.0 * np.pi) - 0.5) * turn
-    return radar.undistort_points(points * (1.0 - nearer)[:, None], seconds, twist)
+    return radar.deskew_points(points * (1.0 - nearer)[:, None], seconds, twist)
 
 
 def build_local_map(clouds: Sequence[np.ndarray], settings: MapSettings) -> LocalMap | None:

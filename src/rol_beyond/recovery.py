@@ -118,7 +118,7 @@ class RelocalizationSettings:
     trusted_pause: int = 12
     far_pause: int = 20
     reach_m: float = 30.0
-    reach_yaw: float = np.deg2rad(30.0)
+    reach_yaw: float = float(np.deg2rad(30.0))
     far_after: int = 120
     far_reach_m: float = 300.0
     workers: int = 1

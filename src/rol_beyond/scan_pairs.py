@@ -106,7 +106,7 @@ class ScanPairs:
         from rol.oxford import load_radar
 
         scan = load_radar(self.session.radar_path(self.jobs[index]["radar_stamp"]))
-        codes = shift_codes(scan.codes, gain_db)
+        codes = shift_codes(scan.power, gain_db)
         if n_streaks + n_ghosts > 0:
             if rng is None:
                 raise ValueError("streaks and ghosts need a generator of random numbers")
@@ -234,12 +234,7 @@ def turned_radar_image(
     image : array, shape (width, width), uint8
         Power 0..255.
     """
-    from rol.radar import (
-        DOPPLER_SECONDS,
-        MEASURED_RANGE_OFFSET,
-        MEASURED_RANGE_RESOLUTION,
-        polar_to_cartesian,
-    )
+    from rol.radar import DOPPLER_SECONDS, MEASURED, RangeCalibration, ScanMotion, polar_to_cartesian
 
     c, s = np.cos(turn), np.sin(turn)
     vx, vy, rate = twist
@@ -247,12 +242,15 @@ def turned_radar_image(
     power = polar_to_cartesian(
         codes,
         azimuths + turn,
-        range_resolution=settings.get("range_resolution", MEASURED_RANGE_RESOLUTION),
-        range_offset=settings.get("range_offset", MEASURED_RANGE_OFFSET),
+        calibration=RangeCalibration(
+            settings.get("range_resolution", MEASURED.resolution_m),
+            settings.get("range_offset", MEASURED.offset_m),
+        ),
         pixel_size=settings.get("pixel_size", 0.25),
         width=settings.get("width", 512),
-        twist=turned if settings.get("motion", "none") == "corrected" else None,
-        doppler_seconds=settings.get("doppler_seconds", DOPPLER_SECONDS),
+        motion=ScanMotion(turned, doppler_seconds=settings.get("doppler_seconds", DOPPLER_SECONDS))
+        if settings.get("motion", "none") == "corrected"
+        else None,
     )
     return np.rint(power * 255.0).astype(np.uint8)
 

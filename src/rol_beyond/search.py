@@ -58,11 +58,11 @@ class SearchSettings:
 
     reach_m: float
     reach_yaw: float = np.pi
-    yaw_step: float = np.deg2rad(1.0)
+    yaw_step: float = float(np.deg2rad(1.0))
     n_refined: int = 100
     n_best: int = 20
     separation_m: float = 2.0
-    separation_yaw: float = np.deg2rad(6.0)
+    separation_yaw: float = float(np.deg2rad(6.0))
     max_points: int = 1000
     workers: int = 1
 

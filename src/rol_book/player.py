@@ -15,6 +15,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from string import Template
 
+import cv2
 import numpy as np
 
 from rol.geometry import first_of_cells
@@ -186,8 +187,6 @@ def play_images(
 
 def _encode(image: np.ndarray, colour: str | None, size: int, quality: int) -> str:
     """Write an image as an address that holds it: JPEG of its greys, dark on white, or PNG in one colour."""
-    import cv2
-
     image = np.asarray(image)
     if image.ndim != 2 or image.dtype != np.uint8:
         raise ValueError(

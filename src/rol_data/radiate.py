@@ -33,7 +33,7 @@ class RadiatePair:
     ----------
     radar_path, lidar_path : Path
         The files.
-    codes : array, shape (400, 576), uint8
+    power : array, shape (400, 576), uint8
         The scan, one row per azimuth, one column per range bin.
     points : array, shape (n, 4)
         The sweep in the radar frame: x, y, z [m], intensity. The car's motion is not taken out.
@@ -43,7 +43,7 @@ class RadiatePair:
 
     radar_path: Path
     lidar_path: Path
-    codes: np.ndarray
+    power: np.ndarray
     points: np.ndarray
     gap_s: float
 
@@ -86,7 +86,7 @@ def load_pairs(real_root: Path | str) -> list[RadiatePair]:
         nearest = min(there, key=lambda number: abs(there[number] - scans[path.stem]))
         points = _load_sweep(lidar_paths[nearest]) + np.append(lidar_place, 0.0)
         gap_s = there[nearest] - scans[path.stem]
-        pairs.append(RadiatePair(path, lidar_paths[nearest], _load_codes(path), points, gap_s))
+        pairs.append(RadiatePair(path, lidar_paths[nearest], _load_power(path), points, gap_s))
     return pairs
 
 
@@ -112,7 +112,7 @@ def _load_lidar_place(path: Path) -> np.ndarray:
     return np.array([forward, -right, up])
 
 
-def _load_codes(path: Path) -> np.ndarray:
+def _load_power(path: Path) -> np.ndarray:
     import cv2
 
     image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)

@@ -43,8 +43,8 @@ class RealScan:
         The file.
     stamp_us : int
         Time of its first row [us].
-    codes, azimuths : array, shape (400, b) and (400,)
-        Power codes, and counter-clockwise bearings of the rows [rad].
+    power, azimuths : array, shape (400, b) and (400,)
+        Power power, and counter-clockwise bearings of the rows [rad].
     pose : array, shape (3,)
         Pose of the radar at mid-scan in the frame of the map [m, m, rad].
     twist : tuple of float, or None
@@ -53,7 +53,7 @@ class RealScan:
 
     path: Path
     stamp_us: int
-    codes: np.ndarray
+    power: np.ndarray
     azimuths: np.ndarray
     pose: np.ndarray
     twist: tuple[float, float, float] | None
@@ -243,7 +243,7 @@ def load_scans(real_root: Path | str) -> list[RealScan]:
     for stamp in stamps:
         path = folder / f"{stamp}.png"
         scan = load_radar(path)
-        scans.append(RealScan(path, stamp, scan.codes, scan.azimuths, poses[stamp], twists.get(stamp)))
+        scans.append(RealScan(path, stamp, scan.power, scan.azimuths, poses[stamp], twists.get(stamp)))
     return scans
 
 

@@ -9,15 +9,18 @@ from __future__ import annotations
 
 from itertools import pairwise
 
+import cv2
 import numpy as np
+from scipy.spatial import cKDTree
 
-from rol.geometry import relative_pose
+from rol.geometry import relative_pose, transform_points
+from rol.radar import MEASURED, ScanMotion, k_strongest_peaks, polar_to_cartesian
+from rol_sim.sensors.radar import beam_azimuths
 
 BRIGHTNESS_CODES = (40, 60, 80, 100, 120)
 ZERO_RANGES_M = (3.0, 28.0, 41.0, 80.0, 106.0, 145.0)
 NEAR_RANGES_M = (0.0, 0.86, 2.0, 3.0)
 PEAK_EDGES = (0, 110, 130, 133, 256)
-MEASURED_RANGE_RESOLUTION = 0.0438  # bins are named by bin * resolution here, as the measured figures are
 QUIET_CODE = 30  # a piece of a row whose codes stay below this holds noise and little else
 FAR_BIN = 3000
 
@@ -35,7 +38,9 @@ def forbidden_codes() -> np.ndarray:
     return np.setdiff1d(np.arange(24), reachable).astype(np.uint8)
 
 
-def brightness_shares(codes: np.ndarray, codes_from: tuple[int, ...] = BRIGHTNESS_CODES) -> dict[int, float]:
+def brightness_fractions(
+    codes: np.ndarray, codes_from: tuple[int, ...] = BRIGHTNESS_CODES
+) -> dict[int, float]:
     """Give the share of pixels at or above each code.
 
     Parameters
@@ -88,7 +93,9 @@ def hellinger_distance(p: np.ndarray, q: np.ndarray) -> float:
     return float(np.sqrt(max(0.0, 1.0 - np.sum(np.sqrt(np.asarray(p) * np.asarray(q))))))
 
 
-def zero_shares(codes: np.ndarray, ranges_m: tuple[float, ...] = ZERO_RANGES_M, half_bins: int = 15) -> dict:
+def zero_fractions(
+    codes: np.ndarray, ranges_m: tuple[float, ...] = ZERO_RANGES_M, half_bins: int = 15
+) -> dict:
     """Give the share of code 0 in quiet bins at several ranges.
 
     Parameters
@@ -96,7 +103,7 @@ def zero_shares(codes: np.ndarray, ranges_m: tuple[float, ...] = ZERO_RANGES_M, 
     codes : array, shape (..., 400, 3768), uint8
         Scans.
     ranges_m : tuple of float
-        Ranges, counted as bin * 0.0438 [m].
+        Ranges, counted as bin * MEASURED.resolution_m [m].
     half_bins : int
         Pieces of 2 * half_bins bins around a range are looked at; those that reach code 30 are left out.
 
@@ -108,7 +115,7 @@ def zero_shares(codes: np.ndarray, ranges_m: tuple[float, ...] = ZERO_RANGES_M, 
     scans = _rows(codes)
     shares = {}
     for range_m in ranges_m:
-        middle = round(range_m / MEASURED_RANGE_RESOLUTION)
+        middle = round(range_m / MEASURED.resolution_m)
         piece = scans[:, max(middle - half_bins, 0) : middle + half_bins]
         quiet = piece[piece.max(axis=1) < QUIET_CODE]
         shares[range_m] = float((quiet == 0).mean()) if len(quiet) else float("nan")
@@ -174,7 +181,7 @@ def near_field(codes: np.ndarray, ranges_m: tuple[float, ...] = NEAR_RANGES_M) -
     codes : array, shape (..., 400, 3768), uint8
         Scans.
     ranges_m : tuple of float
-        Ranges, counted as bin * 0.0438 [m].
+        Ranges, counted as bin * MEASURED.resolution_m [m].
 
     Returns
     -------
@@ -182,7 +189,7 @@ def near_field(codes: np.ndarray, ranges_m: tuple[float, ...] = NEAR_RANGES_M) -
         Range [m] -> mean code over all rows.
     """
     scans = _rows(codes)
-    return {r: float(scans[:, round(r / MEASURED_RANGE_RESOLUTION)].mean()) for r in ranges_m}
+    return {r: float(scans[:, round(r / MEASURED.resolution_m)].mean()) for r in ranges_m}
 
 
 def floor_by_peak(codes: np.ndarray, edges: tuple[int, ...] = PEAK_EDGES) -> dict[str, float]:
@@ -292,19 +299,13 @@ def _mean_correlation(
     codes: np.ndarray, ways: np.ndarray, lag: int, twists: np.ndarray | None, doppler_seconds: float
 ) -> float:
     """Mean correlation of scans i and i + lag, as images of 0.25 m per pixel laid on each other."""
-    import cv2
-
-    from rol.radar import MEASURED_RANGE_OFFSET, polar_to_cartesian
-    from rol_sim.sensors.radar import beam_azimuths
-
     azimuths = beam_azimuths()
     width, pixel, found = 512, 0.25, []
     middle = (width - 1) / 2.0
     images = [
         polar_to_cartesian(
-            scan, azimuths, range_resolution=MEASURED_RANGE_RESOLUTION, range_offset=MEASURED_RANGE_OFFSET,
-            pixel_size=pixel, width=width, twist=None if twists is None else twists[i],
-            doppler_seconds=doppler_seconds,
+            scan, azimuths, calibration=MEASURED, pixel_size=pixel, width=width,
+            motion=None if twists is None else ScanMotion(twists[i], doppler_seconds=doppler_seconds),
         )
         for i, scan in enumerate(codes)
     ]  # fmt: skip
@@ -332,11 +333,11 @@ def scan_statistics(codes: np.ndarray) -> dict:
     Returns
     -------
     statistics : dict
-        "histogram": share of every code; "shares": code -> share of pixels at or above it; "zero_shares": range [m] -> share of code 0 in quiet
+        "histogram": share of every code; "shares": code -> share of pixels at or above it; "zero_fractions": range [m] -> share of code 0 in quiet
         bins; "range_correlation": of the noise at lags 1-7 bins; "azimuth_correlation"; "near_field": range
         [m] -> mean code; "near_copies": True when bins 0-4 are identical; "floors": class of peak -> far
         floor; "point_spread": levels [dB] by distance; "forbidden": number of pixels with a code that cannot
-        be; "greatest": greatest code; "shares_40_by_range": share of codes >= 40 by range, edges [m] as keys.
+        be; "greatest": greatest code; "fractions_40_by_range": share of codes >= 40 by range, edges [m] as keys.
 
     Raises
     ------
@@ -349,9 +350,9 @@ def scan_statistics(codes: np.ndarray) -> dict:
     near = _rows(codes)[:, :5]
     return {
         "histogram": code_histogram(codes),
-        "shares": brightness_shares(codes),
-        "shares_40_by_range": shares_by_range(codes, 40),
-        "zero_shares": zero_shares(codes),
+        "shares": brightness_fractions(codes),
+        "fractions_40_by_range": fractions_by_range(codes, 40),
+        "zero_fractions": zero_fractions(codes),
         "range_correlation": noise_correlation(codes),
         "azimuth_correlation": azimuth_correlation(codes),
         "near_field": near_field(codes),
@@ -363,7 +364,7 @@ def scan_statistics(codes: np.ndarray) -> dict:
     }
 
 
-def shares_by_range(
+def fractions_by_range(
     codes: np.ndarray, code: int, edges_m: tuple[float, ...] = (2.5, 5, 10, 20, 30, 50, 80, 110, 165)
 ) -> dict:
     """Give the share of pixels at or above a code, ring by ring.
@@ -375,20 +376,20 @@ def shares_by_range(
     code : int
         Code to count from.
     edges_m : tuple of float
-        Edges of the rings, counted as bin * 0.0438 [m].
+        Edges of the rings, counted as bin * MEASURED.resolution_m [m].
 
     Returns
     -------
     shares : dict
         "low-high" [m] -> share [0..1].
     """
-    scans, bins = _rows(codes), [round(edge / MEASURED_RANGE_RESOLUTION) for edge in edges_m]
+    scans, bins = _rows(codes), [round(edge / MEASURED.resolution_m) for edge in edges_m]
     names = [f"{low:g}-{high:g}" for low, high in pairwise(edges_m)]
     shares = [float((scans[:, low:high] >= code).mean()) for low, high in pairwise(bins)]
     return dict(zip(names, shares, strict=True))
 
 
-def map_shares(
+def map_fractions(
     codes: np.ndarray,
     poses: np.ndarray,
     map_points: np.ndarray,
@@ -419,17 +420,10 @@ def map_shares(
     shares : array, shape (n, len(within_m))
         Share of the peaks of each scan; NaN for a scan without peaks.
     """
-    from scipy.spatial import cKDTree
-
-    from rol.geometry import transform_points
-    from rol.radar import MEASURED_RANGE_OFFSET, k_strongest_peaks
-    from rol_sim.sensors.radar import beam_azimuths
-
     tree, shares = cKDTree(map_points), []
     for scan, pose in zip(codes, poses, strict=True):
         peaks = k_strongest_peaks(
-            scan, beam_azimuths(), k, min_code, max_range_m=max_range_m,
-            range_resolution=MEASURED_RANGE_RESOLUTION, range_offset=MEASURED_RANGE_OFFSET,
+            scan, beam_azimuths(), k, min_code, range_limits_m=(2.5, max_range_m), calibration=MEASURED,
         )  # fmt: skip
         gaps = tree.query(transform_points(pose, peaks))[0]
         shares.append([float(np.mean(gaps < limit)) if len(gaps) else float("nan") for limit in within_m])

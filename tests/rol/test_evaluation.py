@@ -20,14 +20,14 @@ from rol.evaluation import (
     write_metrics,
     write_tum,
 )
-from rol.geometry import accumulate_steps, compose
+from rol.geometry import accumulate_increments, compose
 
 QUARTER_US = 250_000
 
 
 def noisy_run(n: int = 50) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Stamps, estimate and truth of a made-up drive in a bend."""
-    truth = accumulate_steps(np.tile((1.0, 0.0, 0.05), (n - 1, 1)), (100.0, -20.0, 3.0))
+    truth = accumulate_increments(np.tile((1.0, 0.0, 0.05), (n - 1, 1)), (100.0, -20.0, 3.0))
     noise = np.random.default_rng(1).normal(0.0, (0.5, 0.3, 0.02), (n, 3))
     return 1_547_120_789_640_420 + QUARTER_US * np.arange(n), compose(truth, noise), truth
 
@@ -94,18 +94,22 @@ def test_failure_gives_the_true_pose():
 def test_drift_by_length_of_a_scale_error_and_a_constant_turn():
     # 250 m straight: 3 % short, then 0.001 rad off in each metre; no segments of 300 m
     steps = np.tile((1.0, 0.0, 0.0), (250, 1))
-    report = drift_by_length(accumulate_steps(steps * 0.97), accumulate_steps(steps), (100.0, 150.0, 300.0))
+    report = drift_by_length(
+        accumulate_increments(steps * 0.97), accumulate_increments(steps), (100.0, 150.0, 300.0)
+    )
     np.testing.assert_array_equal(report.lengths_m, (100.0, 150.0))
     np.testing.assert_array_equal(report.n_segments, (16, 11))  # from 0, 10 ... 150; and 0, 10 ... 100
     np.testing.assert_allclose(report.translation_pct, 3.0)
     assert report.mean_translation_pct == pytest.approx(3.0)
     assert np.abs(report.rotation_deg_per_100m).max() < 1e-9
-    turning = drift_by_length(accumulate_steps(steps + (0, 0, -0.001)), accumulate_steps(steps), (100.0,))
+    turning = drift_by_length(
+        accumulate_increments(steps + (0, 0, -0.001)), accumulate_increments(steps), (100.0,)
+    )
     np.testing.assert_allclose(turning.rotation_deg_per_100m, np.rad2deg(0.1))
 
 
 def test_drift_over_a_way_too_short_has_no_length_left():
-    poses = accumulate_steps(np.tile((1.0, 0.0, 0.0), (50, 1)))
+    poses = accumulate_increments(np.tile((1.0, 0.0, 0.0), (50, 1)))
     report = drift_by_length(poses, poses)
     assert len(report.lengths_m) == len(report.n_segments) == len(report.translation_pct) == 0
     assert np.isnan(report.mean_translation_pct) and np.isnan(report.mean_rotation_deg_per_100m)
@@ -143,8 +147,10 @@ def test_drift_by_length_agrees_with_a_slow_loop():
     steps = np.column_stack(
         [rng.uniform(0.0, 2.5, 900), rng.normal(0.0, 0.02, 900), rng.normal(0.0, 0.03, 900)]
     )
-    truth = accumulate_steps(steps)
-    estimate = accumulate_steps(steps * (0.98, 1.0, 1.0) + rng.normal(0.0, (0.05, 0.02, 0.002), (900, 3)))
+    truth = accumulate_increments(steps)
+    estimate = accumulate_increments(
+        steps * (0.98, 1.0, 1.0) + rng.normal(0.0, (0.05, 0.02, 0.002), (900, 3))
+    )
     report = drift_by_length(estimate, truth)
     loop = kitti_loop(estimate, truth, [100.0 * k for k in range(1, 9)])
     assert report.lengths_m.tolist() == list(loop) == [100.0 * k for k in range(1, 9)]

@@ -1,6 +1,7 @@
-"""The examples of the pages run as they stand, in a folder that holds nothing but the files which the page names.
+"""The examples of book/take.md run in a folder that holds nothing but the files which the page names.
 
-And the pages on symbols and on citing say what the code and the bibliography say.
+Each one runs twice: with the files beside it, and with the files in a package. The pages on symbols and on citing
+agree with the code and the bibliography.
 """
 
 import ast
@@ -16,18 +17,16 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Iterable
+from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
 import yaml
 from packaging.requirements import Requirement
 
-import toolbox_pages
-
 ROOT = Path(__file__).resolve().parents[2]
 PACKAGE = ROOT / "src" / "rol"
 TAKE, OWN_RADAR = ROOT / "book" / "take.md", ROOT / "book" / "own_radar.md"
-EXAMPLES = toolbox_pages.read_examples(TAKE)
 # What the modules import, by the name that pip knows it by.
 PACKAGES = {
     "numpy": "numpy", "scipy": "scipy", "numba": "numba", "pandas": "pandas", "torch": "torch",
@@ -35,10 +34,52 @@ PACKAGES = {
     "open3d-cpu": "open3d", "pyyaml": "yaml",
 }  # fmt: skip
 
-# Those with torch take turns in one process, for importing it takes longer than the examples do.
+# Modules that may import torch; no module of `rol` may import open3d or matplotlib.
+WITH_TORCH = {"fakes", "pix2pix", "training"}
+END = "----- end of an example -----\n"
+
+
+@dataclass(frozen=True)
+class Example:
+    """An example of the page.
+
+    Attributes
+    ----------
+    packages, files : set of str
+        What must be installed, and the files that must lie beside the module.
+    code, printed : str
+        The example with the files beside it, and what it prints.
+    """
+
+    packages: set[str]
+    files: set[str]
+    code: str
+    printed: str
+
+    @property
+    def code_for_package(self) -> str:
+        """Import the modules from the package `tools`."""
+        modules = "|".join(file.stem for file in PACKAGE.glob("[!.]*.py"))
+        return re.sub(rf"^from ({modules}) import", r"from tools.\1 import", self.code, flags=re.MULTILINE)
+
+
+def read_examples(page: Path) -> dict[str, Example]:
+    """Read the examples of a page: headings with a module's name, a line of needs, code, and what it prints."""
+    parts = re.split(r"^### \[(\w+)\]\(.*\)\n", page.read_text(encoding="utf-8"), flags=re.MULTILINE)[1:]
+    found = {}
+    for name, text in zip(parts[::2], parts[1::2], strict=True):
+        packages, beside = re.search(r"^Packages: (.*?)\. Beside it: (.*)\.$", text, re.MULTILINE).groups()
+        code = re.search(r"^```python\n(.*?)^```$", text, re.MULTILINE | re.DOTALL)[1]
+        printed = re.search(r"^```text\n(.*?)^```$", text, re.MULTILINE | re.DOTALL)[1]
+        packages = {word for word in packages.split(", ") if word != "none"}
+        found[name] = Example(packages, set(re.findall(r"`(\w+\.py)`", beside)), code, printed)
+    return found
+
+
+EXAMPLES = read_examples(TAKE)
+# Those with torch take turns in one process, since importing it takes longer than the examples.
 GROUPS = [[name] for name, example in EXAMPLES.items() if "torch" not in example.packages]
 GROUPS.append([name for name, example in EXAMPLES.items() if "torch" in example.packages])
-END = "----- end of an example -----\n"
 # Runs `example.py` in each folder as `python example.py` would, with nothing installed but what lies in the first one.
 RUN_ALONE = """
 import os, runpy, sys
@@ -95,13 +136,10 @@ def run_examples(folders: Iterable[Path], packages: Iterable[str]) -> list[str]:
 
 
 def copy_files(names: Iterable[str], folder: Path) -> None:
-    """Copy files of the package, or the folder `virtual`, without what is compiled of them."""
-    folder.mkdir(exist_ok=True)
+    """Copy files of the package."""
+    folder.mkdir(parents=True, exist_ok=True)
     for name in names:
-        if (PACKAGE / name).is_dir():
-            shutil.copytree(PACKAGE / name, folder / name, ignore=shutil.ignore_patterns("__pycache__"))
-        else:
-            shutil.copy(PACKAGE / name, folder)
+        shutil.copy(PACKAGE / name, folder)
 
 
 def code_blocks(page: Path, section: str) -> list[tuple[str, str]]:
@@ -113,49 +151,51 @@ def code_blocks(page: Path, section: str) -> list[tuple[str, str]]:
 # ---- each file ------------------------------------------------------------------------------------------------
 
 
-def test_every_file_has_an_example() -> None:
-    files = {file.stem for file in PACKAGE.glob("[!.]*.py") if not file.name.startswith("__")}
-    assert set(EXAMPLES) == files | {"virtual"}
+def test_every_module_has_an_example() -> None:
+    modules = {file.stem for file in PACKAGE.glob("[!.]*.py") if not file.name.startswith("__")}
+    assert set(EXAMPLES) == modules
 
 
 @pytest.mark.parametrize("group", GROUPS, ids="-".join)
-def test_examples_run_with_what_the_page_names(group: list[str], tmp_path: Path) -> None:
+def test_examples_run_flat_and_as_a_package_with_what_the_page_names(
+    group: list[str], tmp_path: Path
+) -> None:
+    folders = []
     for name in group:
-        own = name if (PACKAGE / name).is_dir() else f"{name}.py"
-        (tmp_path / name).mkdir()
-        is_in_folder = "from tools." in EXAMPLES[name].code
-        copy_files([own, *EXAMPLES[name].files], tmp_path / name / ("tools" if is_in_folder else ""))
-        (tmp_path / name / "example.py").write_text(EXAMPLES[name].code, encoding="utf-8")
-    packages = set.union(*(EXAMPLES[name].packages for name in group))
-    printed = run_examples([tmp_path / name for name in group], packages)
-    assert dict(zip(group, printed, strict=True)) == {name: EXAMPLES[name].printed for name in group}
+        files, example = [f"{name}.py", *EXAMPLES[name].files], EXAMPLES[name]
+        for layout, code in ((".", example.code), ("tools", example.code_for_package)):
+            folder = tmp_path / f"{name}-{layout.strip('.')}"
+            copy_files(files, folder / layout)
+            (folder / "example.py").write_text(code, encoding="utf-8")
+            folders.append(folder)
+    printed = run_examples(folders, set.union(*(EXAMPLES[name].packages for name in group)))
+    expected = [EXAMPLES[name].printed for name in group for _ in range(2)]
+    found = {folder.name: text for folder, text in zip(folders, printed, strict=True)}
+    assert found == dict(zip(found, expected, strict=True))
 
 
 @pytest.mark.parametrize("name", EXAMPLES)
-def test_page_names_all_that_a_file_needs(name: str) -> None:
-    files, packages = follow_imports(PACKAGE / name if name == "virtual" else PACKAGE / f"{name}.py")
-    line = EXAMPLES[name].needs
-    named = {word for word in re.split(r"[\s,;.]+", re.sub(r"`[^`]*`", "", line)) if word in PACKAGES}
+def test_page_names_all_that_a_module_needs(name: str) -> None:
+    files, packages = follow_imports(PACKAGE / f"{name}.py")
+    heavy = packages & {"torch", "open3d", "matplotlib"}
+    assert heavy <= {"torch"} and (not heavy or name in WITH_TORCH)
     packages |= {"numpy"} if "torch" in packages else set()  # torch complains where it is not installed
-    assert {PACKAGES[word] for word in named} == packages & set(PACKAGES.values())
-    assert set(re.findall(r"`(\w+\.py)`", line)) == files
+    assert {PACKAGES[word] for word in EXAMPLES[name].packages} == packages & set(PACKAGES.values())
+    assert EXAMPLES[name].files == files
 
 
 def follow_imports(start: Path) -> tuple[set[str], set[str]]:
-    """Find the other files that a file, or those in a folder, import in turn, and all packages that they import."""
-    inside = sorted(start.rglob("[!.]*.py")) if start.is_dir() else [start]
-    left, seen, packages = list(inside), set(inside), set()
+    """Find the other files that a file imports in turn, and all packages that they import."""
+    left, seen, packages = [start], {start}, set()
     while left:
-        file = left.pop()
-        for level, module in runtime_imports(ast.parse(file.read_text(encoding="utf-8"))):
-            base = file.parents[level - 1] if level else file.parent
-            target = base / f"{module}.py"
+        for level, module in runtime_imports(ast.parse(left.pop().read_text(encoding="utf-8"))):
+            target = PACKAGE / f"{module}.py"
             if target.is_file() and target not in seen:
                 seen.add(target)
                 left.append(target)
             elif not target.is_file() and not level:
                 packages.add(module)
-    return {file.name for file in seen - set(inside)}, packages
+    return {file.name for file in seen - {start}}, packages
 
 
 def runtime_imports(node: ast.AST) -> list[tuple[int, str]]:
@@ -189,10 +229,10 @@ def test_mcl_copied_into_an_empty_folder_localizes(tmp_path: Path) -> None:
     assert mean < 0.2 and worst < 0.5 < by_odometry
 
 
-def run_with_package(section: str, folder: Path) -> str:
-    """Run the script of a section of the page on radars of one's own, with the package `rol` at hand."""
+def run_with_packages(section: str, folder: Path) -> str:
+    """Run the script of a section of the page on radars of one's own, with the packages of `src` at hand."""
     blocks = dict(code_blocks(OWN_RADAR, section))
-    shutil.copytree(PACKAGE, folder / "rol", ignore=shutil.ignore_patterns("__pycache__"))
+    shutil.copytree(ROOT / "src", folder, dirs_exist_ok=True, ignore=shutil.ignore_patterns("__pycache__"))
     (folder / "example.py").write_text(blocks["python"], encoding="utf-8")
     [printed] = run_examples([folder], PACKAGES.keys() - {"torch", "safetensors", "open3d-cpu", "matplotlib"})
     assert printed == blocks["text"]
@@ -200,12 +240,12 @@ def run_with_package(section: str, folder: Path) -> str:
 
 
 def test_radar_of_ones_own_is_localized(tmp_path: Path) -> None:
-    error = re.search(r"(\d+\.\d+) m off", run_with_package("Localize on your map", tmp_path))
+    error = re.search(r"(\d+\.\d+) m off", run_with_packages("Localize on your map", tmp_path))
     assert float(error[1]) < 0.3
 
 
 def test_session_of_ones_own_is_read_as_oxfords_and_aligned(tmp_path: Path) -> None:
-    printed = run_with_package("Write Oxford's files", tmp_path)
+    printed = run_with_packages("Write Oxford's files", tmp_path)
     assert printed.splitlines()[0] == "[]"
     for place in re.findall(r"(\d+\.\d+) m to the left", printed):
         assert abs(float(place) - 20.0) <= 0.25

@@ -13,7 +13,7 @@ import generate_images
 from rol import fakes, pix2pix
 from rol.fakes import finish_fakes, list_fakes, prepare_fakes, read_image, write_fakes
 from rol.pix2pix import build_generator, generate, save_weights
-from rol.radar import compensate_points
+from rol.radar import ScanMotion, compensate_points
 
 pytestmark = pytest.mark.torch
 STAMPS = [1_000_000, 1_250_000, 1_500_000]
@@ -149,7 +149,7 @@ def test_points_are_moved_to_mid_scan_once(session: Path, weights: Path, tmp_pat
     recorded = list(fakes.read_points(folder, STAMPS))
     assert all(len(points) for points in recorded)
     moved = list(fakes.read_points(folder, STAMPS, twists))
-    np.testing.assert_array_equal(moved[1], compensate_points(recorded[1], twists[1]))
+    np.testing.assert_array_equal(moved[1], compensate_points(recorded[1], ScanMotion(twists[1])))
     assert np.abs(moved[1] - recorded[1]).max() > 0.1
     about = json.loads((folder / "fake.json").read_text(encoding="utf-8"))
     about["settings"]["pairs"]["motion"] = "corrected"  # the images are of mid-scan already

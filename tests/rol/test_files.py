@@ -14,6 +14,7 @@ from rol import evaluation, files, maps, oxford, pairs
 from rol.fakes import prepare_fakes
 from rol.pairs import prepare_pairs
 from rol_data import rall
+from rol_sim.session import oxford_files
 from rol_sim.session.settings import load_settings
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -36,8 +37,8 @@ WRITERS = {
     "map.npz": lambda path: maps.save_map(path, POINTS, np.zeros(3)),
     "run.tum": lambda path: evaluation.write_tum(path, np.array([1, 2]), np.zeros((2, 3))),
     "metrics.json": lambda path: evaluation.write_metrics(path, METRICS),
-    "radar.timestamps": lambda path: oxford.save_timestamps(path, np.array([1, 2])),
-    "1.bin": lambda path: oxford.save_velodyne_binary(path, np.ones((3, 4))),
+    "radar.timestamps": lambda path: oxford_files.save_timestamps(path, np.array([1, 2])),
+    "1.bin": lambda path: oxford_files.save_velodyne_binary(path, np.ones((3, 4))),
     "weights.safetensors": save_history,
     "settings.json": lambda path: prepare_fakes(path.parent, {"weights": "a"}),
 }
@@ -100,7 +101,7 @@ def test_other_encodings_are_named(tmp_path: Path) -> None:
         ("1 1\n2 1\n", lambda path: oxford.load_timestamps(path)[0].tolist()),
         (
             ",".join(oxford.ODOMETRY_COLUMNS) + "\n375000,125000,1,0,0,0,0,0,250000,1\n",
-            lambda path: oxford.load_radar_odometry(path).steps.tolist(),
+            lambda path: oxford.load_radar_odometry(path).increments.tolist(),
         ),
         ("1 2 3\n", lambda path: rall.load_poses(path).tolist()),
         ("timestamp_us,x_m,y_m,yaw_rad\n1,0,0,0\n", lambda path: list(rall.load_scan_poses(path))),

@@ -51,7 +51,7 @@ def test_relative_pose():
 def test_accumulate_steps_around_a_square():
     steps = [[2, 0, QUARTER]] * 4
     expected = [[0, 0, 0], [2, 0, QUARTER], [2, 2, -np.pi], [0, 2, -QUARTER], [0, 0, 0]]
-    poses = geometry.accumulate_steps(steps)
+    poses = geometry.accumulate_increments(steps)
     assert_allclose(poses[:, :2], np.array(expected)[:, :2], atol=1e-12)
     assert_allclose(np.abs(geometry.wrap_angle(poses[:, 2] - np.array(expected)[:, 2])), 0, atol=1e-12)
 
@@ -59,7 +59,7 @@ def test_accumulate_steps_around_a_square():
 def test_accumulate_steps_agrees_with_compose_from_any_start():
     steps = np.random.default_rng(3).normal(size=(20, 3))
     pose = np.array([3.0, -1.0, 2.0])
-    poses = geometry.accumulate_steps(steps, pose)
+    poses = geometry.accumulate_increments(steps, pose)
     for step, expected in zip(steps, poses[1:], strict=True):
         pose = geometry.compose(pose, step)
         assert_allclose(pose[:2], expected[:2], atol=1e-12)
@@ -67,7 +67,7 @@ def test_accumulate_steps_agrees_with_compose_from_any_start():
 
 
 def test_accumulate_no_steps_is_the_start():
-    assert_allclose(geometry.accumulate_steps(np.zeros((0, 3)), (1, 2, 0.5)), [[1, 2, 0.5]])
+    assert_allclose(geometry.accumulate_increments(np.zeros((0, 3)), (1, 2, 0.5)), [[1, 2, 0.5]])
 
 
 def test_transform_points():
@@ -90,7 +90,7 @@ def test_exp_in_closed_form():
 def test_exp_is_the_limit_of_many_small_steps():
     twist, n = np.array([[9.0, -0.4, 0.7], [-3.0, 0.2, -2.0]]), 100_000
     for one, pose in zip(twist, geometry.exp(twist, 0.5), strict=True):
-        poses = geometry.accumulate_steps(np.tile(one * 0.5 / n, (n, 1)))
+        poses = geometry.accumulate_increments(np.tile(one * 0.5 / n, (n, 1)))
         assert_allclose(poses[-1], pose, atol=2e-5)
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from rol.geometry import accumulate_steps, compose, invert, relative_pose, transform_points
+from rol.geometry import accumulate_increments, compose, invert, relative_pose, transform_points
 from rol.odometry import (
     IcpSettings,
     OdometryError,
@@ -150,7 +150,7 @@ def test_too_few_iterations_are_flagged():
 def test_scan_to_scan_icp_follows_steps_too_long_for_a_guess_of_zero():
     # at 4 m a scan the nearest post is the wrong one; the guess of constant velocity finds the right one
     steps = np.tile((1.0, 0.0, 0.02), (12, 1)) * np.linspace(0.5, 4.0, 12)[:, None]
-    poses, world = accumulate_steps(steps), posts()
+    poses, world = accumulate_increments(steps), posts()
     clouds = [transform_points(invert(pose), world) for pose in poses]
     found = stack_increments(scan_to_scan_icp(clouds))
     np.testing.assert_allclose(found, steps, atol=0.01)
@@ -158,7 +158,7 @@ def test_scan_to_scan_icp_follows_steps_too_long_for_a_guess_of_zero():
 
 
 def test_scan_to_scan_icp_goes_on_through_an_empty_cloud():
-    world, poses = posts(), accumulate_steps(np.tile((0.5, 0.0, 0.0), (4, 1)))
+    world, poses = posts(), accumulate_increments(np.tile((0.5, 0.0, 0.0), (4, 1)))
     clouds = [transform_points(invert(pose), world) for pose in poses]
     clouds[2] = np.zeros((0, 2))
     results = list(scan_to_scan_icp(clouds))

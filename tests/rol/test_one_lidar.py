@@ -11,6 +11,7 @@ import pytest
 from rol import oxford
 from rol.alignment import align_scans, measure_misalignment, usable_sweeps
 from rol.pairs import build_pair, estimate_twists, job_of_row, load_lidar_points
+from rol_sim.session import oxford_files
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -46,7 +47,7 @@ def test_each_lidar_alone_is_read_with_its_own_mounting(left_only: oxford.Sessio
     stamp = int(left_only.left_stamps_us[3])
     left = load_lidar_points(left_only, stamp, None)
     root = left_only.root.with_name("right-only")
-    oxford.save_velodyne_binary(
+    oxford_files.save_velodyne_binary(
         root / "velodyne_right" / f"{stamp}.bin", oxford.load_sweep(left_only, "velodyne_left", stamp)[0]
     )
     right_only = replace(left_only, root=root, left_stamps_us=None, right_stamps_us=np.array([stamp]))

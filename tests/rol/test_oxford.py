@@ -1,4 +1,4 @@
-"""Readers and writers of one Oxford session: real files, files made by hand, every fault that users meet."""
+"""Readers of one Oxford session, and its writers in rol_sim.session.oxford_files: real files, files made by hand, every fault that users meet."""
 
 import dataclasses
 import shutil
@@ -11,6 +11,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from rol import oxford
 from rol.geometry import wrap_angle
 from rol.oxford import OxfordError
+from rol_sim.session import oxford_files
 
 START = 1547131046353776  # the first real scan's name
 
@@ -73,16 +74,16 @@ def session_root(tmp_path):
     scan, raw = make_scan(), make_raw()
     for stamp in scans:
         moved = dataclasses.replace(scan, row_stamps_us=scan.row_stamps_us + stamp - START)
-        oxford.save_radar(root / "radar" / f"{stamp}.png", moved)
+        oxford_files.save_radar(root / "radar" / f"{stamp}.png", moved)
     points, _ = oxford.velodyne_raw_to_points(raw)
     for stamp in sweeps:
         moved = dataclasses.replace(raw, stamps_us=raw.stamps_us + stamp - START)
-        oxford.save_velodyne_raw(root / "velodyne_left" / f"{stamp}.png", moved)
-        oxford.save_velodyne_binary(root / "velodyne_right" / f"{stamp}.bin", points)
-    oxford.save_timestamps(root / "radar.timestamps", scans)
-    oxford.save_timestamps(root / "velodyne_left.timestamps", sweeps)
-    oxford.save_timestamps(root / "velodyne_right.timestamps", sweeps)
-    oxford.save_radar_odometry(root / "gt/radar_odometry.csv", make_odometry(scans[:5]))
+        oxford_files.save_velodyne_raw(root / "velodyne_left" / f"{stamp}.png", moved)
+        oxford_files.save_velodyne_binary(root / "velodyne_right" / f"{stamp}.bin", points)
+    oxford_files.save_timestamps(root / "radar.timestamps", scans)
+    oxford_files.save_timestamps(root / "velodyne_left.timestamps", sweeps)
+    oxford_files.save_timestamps(root / "velodyne_right.timestamps", sweeps)
+    oxford_files.save_radar_odometry(root / "gt/radar_odometry.csv", make_odometry(scans[:5]))
     (root / "gps").mkdir()
     (root / "gps/gps.csv").write_text(GPS_TEXT, encoding="utf-8")
     (root / "gps/ins.csv").write_text(INS_TEXT, encoding="utf-8")
@@ -105,11 +106,11 @@ def test_real_scans_round_trip(real_root, tmp_path):
         assert (np.diff(scan.azimuths) < 0).all()
         assert (scan.valid == 255).all()
         copy, again = tmp_path / path.name, tmp_path / "again" / path.name
-        oxford.save_radar(copy, scan)
+        oxford_files.save_radar(copy, scan)
         pixels = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
         assert pixels.shape == (400, 3779)
         assert_array_equal(cv2.imread(str(copy), cv2.IMREAD_UNCHANGED), pixels)
-        oxford.save_radar(again, oxford.load_radar(copy))
+        oxford_files.save_radar(again, oxford.load_radar(copy))
         assert again.read_bytes() == copy.read_bytes()
 
 
@@ -117,12 +118,12 @@ def test_real_scans_round_trip(real_root, tmp_path):
 def test_real_odometry_and_timestamps_round_trip_byte_for_byte(real_root, tmp_path, folder):
     root = real_root / "RadarSLAMPy/data" / folder
     odometry = oxford.load_radar_odometry(root / "gt/radar_odometry.csv")
-    oxford.save_radar_odometry(tmp_path / "odometry.csv", odometry)
+    oxford_files.save_radar_odometry(tmp_path / "odometry.csv", odometry)
     assert (tmp_path / "odometry.csv").read_bytes() == (root / "gt/radar_odometry.csv").read_bytes()
-    assert not odometry.steps_6dof[:, 2:5].any()
+    assert not odometry.increments_6dof[:, 2:5].any()
     stamps, valid = oxford.load_timestamps(root / "radar.timestamps")
     assert valid.all()
-    oxford.save_timestamps(tmp_path / "radar.timestamps", stamps, valid)
+    oxford_files.save_timestamps(tmp_path / "radar.timestamps", stamps, valid)
     assert (tmp_path / "radar.timestamps").read_bytes() == (root / "radar.timestamps").read_bytes()
 
 
@@ -131,7 +132,7 @@ def test_real_gps_round_trips_byte_for_byte(real_root, tmp_path):
     table = oxford.load_gps(path)
     assert table.timestamp[0] == 1547131010502681
     assert table.utm_zone[0] == "30U"
-    oxford.save_gps(tmp_path / "gps.csv", table)
+    oxford_files.save_gps(tmp_path / "gps.csv", table)
     assert (tmp_path / "gps.csv").read_bytes() == path.read_bytes()
 
 
@@ -144,7 +145,7 @@ def test_official_odometry_composes_to_the_published_poses(real_root):
     # The published file has five decimals; 9 km are driven.
     assert np.abs(poses[:, :2] - published[:, :2]).max() < 1e-4
     assert np.abs(wrap_angle(poses[:, 2] - published[:, 2])).max() < 1e-4
-    assert np.hypot(*odometry.steps[:, :2].T).sum() == pytest.approx(9024.6, abs=0.1)
+    assert np.hypot(*odometry.increments[:, :2].T).sum() == pytest.approx(9024.6, abs=0.1)
     stamps, _ = oxford.load_timestamps(root / "radar.timestamps")
     assert_array_equal(radar_stamps, stamps[:-1])  # every scan but the last has a pose
     assert 122_000 < (mid_stamps - radar_stamps).min() and (mid_stamps - radar_stamps).max() < 128_000
@@ -166,16 +167,16 @@ def test_real_sample_opens_as_a_session_without_lidars(real_root):
 def test_radar_bytes_lie_where_the_description_says(tmp_path):
     scan = make_scan()
     path = tmp_path / f"{START}.png"
-    oxford.save_radar(path, scan)
+    oxford_files.save_radar(path, scan)
     pixels = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
     assert bytes(pixels[3, :8]) == (START + 3 * 625).to_bytes(8, "little")
     assert bytes(pixels[300, 8:10]) == (13 + 14 * 300).to_bytes(2, "little")
     assert pixels[7, 10] == 255
-    assert_array_equal(pixels[:, 11:], scan.codes)
+    assert_array_equal(pixels[:, 11:], scan.power)
     loaded = oxford.load_radar(path)
     for field in dataclasses.fields(scan):
         assert_array_equal(getattr(loaded, field.name), getattr(scan, field.name))
-    assert loaded.codes.dtype == np.uint8 and loaded.row_stamps_us.dtype == np.int64
+    assert loaded.power.dtype == np.uint8 and loaded.row_stamps_us.dtype == np.int64
     assert [entry.name for entry in tmp_path.iterdir()] == [path.name]  # no temporary file stays behind
 
 
@@ -189,13 +190,13 @@ def test_azimuths_are_counter_clockwise_and_do_not_wrap():
 def test_interpolated_rows_keep_their_flag(tmp_path):
     valid = np.full(400, 255, np.uint8)
     valid[5] = 0
-    oxford.save_radar(tmp_path / "scan.png", dataclasses.replace(make_scan(), valid=valid))
+    oxford_files.save_radar(tmp_path / "scan.png", dataclasses.replace(make_scan(), valid=valid))
     assert_array_equal(np.flatnonzero(oxford.load_radar(tmp_path / "scan.png").valid != 255), [5])
 
 
 def write_pixels(path, change):
     """Write the image of a good scan after a change to its pixels, past the checks of the writer."""
-    oxford.save_radar(path, make_scan())
+    oxford_files.save_radar(path, make_scan())
     pixels = change(cv2.imread(str(path), cv2.IMREAD_UNCHANGED).copy())
     cv2.imwrite(str(path), pixels)
 
@@ -232,7 +233,7 @@ def test_radar_faults_are_named(tmp_path, change, fault):
 
 
 def test_radar_file_name_must_be_the_first_stamp(tmp_path):
-    oxford.save_radar(tmp_path / f"{START}.png", make_scan())
+    oxford_files.save_radar(tmp_path / f"{START}.png", make_scan())
     other = tmp_path / f"{START + 1}.png"
     shutil.copy(tmp_path / f"{START}.png", other)
     with pytest.raises(
@@ -246,7 +247,7 @@ def test_radar_file_name_must_be_the_first_stamp(tmp_path):
 @pytest.mark.parametrize("share", [0.02, 0.5, 0.9999])
 def test_truncated_png_is_named_without_noise(tmp_path, capfd, share):
     path = tmp_path / f"{START}.png"
-    oxford.save_radar(path, make_scan())
+    oxford_files.save_radar(path, make_scan())
     data = path.read_bytes()
     path.write_bytes(data[: int(len(data) * share)])
     with pytest.raises(OxfordError, match=rf"{path.name}: PNG is truncated or damaged"):
@@ -256,7 +257,7 @@ def test_truncated_png_is_named_without_noise(tmp_path, capfd, share):
 
 def test_damaged_missing_empty_and_foreign_files_are_named(tmp_path, capfd):
     path = tmp_path / f"{START}.png"
-    oxford.save_radar(path, make_scan())
+    oxford_files.save_radar(path, make_scan())
     data = bytearray(path.read_bytes())
     data[len(data) // 2] ^= 0xFF
     path.write_bytes(data)
@@ -276,15 +277,15 @@ def test_damaged_missing_empty_and_foreign_files_are_named(tmp_path, capfd):
 def test_radar_writer_refuses_what_the_reader_would(tmp_path):
     scan, path = make_scan(), tmp_path / f"{START}.png"
     bad = {
-        "codes: expected shape": {"codes": scan.codes[:, :100]},
-        "codes: a value does not fit into uint8": {"codes": scan.codes.astype(float) + 0.5},
+        "power: expected shape": {"power": scan.power[:, :100]},
+        "power: a value does not fit into uint8": {"power": scan.power.astype(float) + 0.5},
         "counters: a value does not fit": {"counters": np.full(400, -1)},
-        "all-zero azimuths": {"codes": np.zeros_like(scan.codes)},
+        "all-zero azimuths": {"power": np.zeros_like(scan.power)},
         "is not the file's name": {"row_stamps_us": scan.row_stamps_us + 1},
     }
     for fault, change in bad.items():
         with pytest.raises(OxfordError, match=fault):
-            oxford.save_radar(path, dataclasses.replace(scan, **change))
+            oxford_files.save_radar(path, dataclasses.replace(scan, **change))
     assert not path.exists()
 
 
@@ -321,7 +322,7 @@ def test_hand_made_sweep_gives_hand_worked_points():
 
 def test_velodyne_bytes_lie_where_the_description_says(tmp_path):
     raw, path = hand_made_sweep(), tmp_path / "velodyne_left" / f"{START}.png"
-    oxford.save_velodyne_raw(path, raw)
+    oxford_files.save_velodyne_raw(path, raw)
     pixels = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
     assert pixels.shape == (106, 3)
     assert pixels[31, 1] == 30
@@ -332,14 +333,14 @@ def test_velodyne_bytes_lie_where_the_description_says(tmp_path):
 
 def test_velodyne_round_trip_and_literal_oracle(tmp_path):
     raw, path = make_raw(), tmp_path / f"{START}.png"
-    oxford.save_velodyne_raw(path, raw)
+    oxford_files.save_velodyne_raw(path, raw)
     loaded = oxford.load_velodyne_raw(path)
     for field in dataclasses.fields(raw):
         values = getattr(loaded, field.name)
         assert_array_equal(values, getattr(raw, field.name))
         assert values.dtype == getattr(raw, field.name).dtype
     first = path.read_bytes()
-    oxford.save_velodyne_raw(path, loaded)
+    oxford_files.save_velodyne_raw(path, loaded)
     assert path.read_bytes() == first
     expected = []
     for column in range(24):
@@ -383,7 +384,7 @@ def zero_column(pixels):
 )
 def test_velodyne_faults_are_named(tmp_path, change, fault):
     path = tmp_path / f"{START}.png"
-    oxford.save_velodyne_raw(path, make_raw())
+    oxford_files.save_velodyne_raw(path, make_raw())
     cv2.imwrite(str(path), change(cv2.imread(str(path), cv2.IMREAD_UNCHANGED)))
     with pytest.raises(OxfordError, match=fault) as error:
         oxford.load_velodyne_raw(path)
@@ -391,15 +392,15 @@ def test_velodyne_faults_are_named(tmp_path, change, fault):
 
 
 def test_velodyne_name_must_be_near_its_stamps(tmp_path):
-    oxford.save_velodyne_raw(tmp_path / f"{START}.png", make_raw())
+    oxford_files.save_velodyne_raw(tmp_path / f"{START}.png", make_raw())
     other = tmp_path / f"{START + 300_000}.png"
     shutil.copy(tmp_path / f"{START}.png", other)
     with pytest.raises(OxfordError, match="not near the file's name"):
         oxford.load_velodyne_raw(other)
     with pytest.raises(OxfordError, match="not near the file's name"):
-        oxford.save_velodyne_raw(other, make_raw())
+        oxford_files.save_velodyne_raw(other, make_raw())
     with pytest.raises(OxfordError, match="sweep without a firing"):
-        oxford.save_velodyne_raw(other, make_raw(n=0))
+        oxford_files.save_velodyne_raw(other, make_raw(n=0))
 
 
 def test_binary_holds_four_rows_in_oxford_axes(tmp_path):
@@ -408,13 +409,13 @@ def test_binary_holds_four_rows_in_oxford_axes(tmp_path):
     points = oxford.load_velodyne_binary(path)
     assert_array_equal(points, [[1, -10, 3, 50], [2, -20, -4, 60]])
     assert points.dtype == np.float32
-    oxford.save_velodyne_binary(tmp_path / "again.bin", points)
+    oxford_files.save_velodyne_binary(tmp_path / "again.bin", points)
     assert (tmp_path / "again.bin").read_bytes() == path.read_bytes()
 
 
 def test_both_formats_give_the_same_points(tmp_path):
     points, _ = oxford.velodyne_raw_to_points(make_raw())
-    oxford.save_velodyne_binary(tmp_path / "sweep.bin", points)
+    oxford_files.save_velodyne_binary(tmp_path / "sweep.bin", points)
     assert_array_equal(oxford.load_velodyne_binary(tmp_path / "sweep.bin"), points)
 
 
@@ -437,7 +438,7 @@ def test_binary_faults_are_named(tmp_path, values, fault):
 def test_binary_writer_refuses_bad_points(tmp_path):
     for points in (np.zeros((0, 4)), np.zeros((5, 3)), np.full((2, 4), np.nan), np.full((2, 4), -1.0)):
         with pytest.raises(OxfordError):
-            oxford.save_velodyne_binary(tmp_path / "sweep.bin", points)
+            oxford_files.save_velodyne_binary(tmp_path / "sweep.bin", points)
     assert not (tmp_path / "sweep.bin").exists()
 
 
@@ -450,7 +451,7 @@ def test_timestamps_keep_flags(tmp_path):
     stamps, valid = oxford.load_timestamps(path)
     assert_array_equal(stamps, [START, START + 250_000])
     assert_array_equal(valid, [True, False])
-    oxford.save_timestamps(tmp_path / "again", stamps, valid)
+    oxford_files.save_timestamps(tmp_path / "again", stamps, valid)
     assert (tmp_path / "again").read_bytes() == path.read_bytes()
 
 
@@ -479,13 +480,13 @@ def test_timestamp_faults_are_named(tmp_path, text, fault):
 def test_timestamp_writer_refuses_bad_stamps(tmp_path):
     for stamps, valid in (([], None), ([2, 1], None), ([1, 2], [True])):
         with pytest.raises(OxfordError):
-            oxford.save_timestamps(tmp_path / "radar.timestamps", stamps, valid)
+            oxford_files.save_timestamps(tmp_path / "radar.timestamps", stamps, valid)
 
 
 def test_gps_and_ins_round_trip_byte_for_byte(tmp_path):
     for text, load, save in (
-        (GPS_TEXT, oxford.load_gps, oxford.save_gps),
-        (INS_TEXT, oxford.load_ins, oxford.save_ins),
+        (GPS_TEXT, oxford.load_gps, oxford_files.save_gps),
+        (INS_TEXT, oxford.load_ins, oxford_files.save_ins),
     ):
         path = tmp_path / "table.csv"
         path.write_text(text, encoding="utf-8")
@@ -507,7 +508,7 @@ def test_table_writer_refuses_what_the_reader_would(tmp_path):
         "stamps out of order in line 3": table[::-1],
     }.items():
         with pytest.raises(OxfordError, match=fault):
-            oxford.save_gps(path, bad)
+            oxford_files.save_gps(path, bad)
     assert path.read_text(encoding="utf-8") == GPS_TEXT  # what was there is still there
 
 
@@ -567,14 +568,16 @@ def test_odometry_is_turned_into_our_axes_and_composed(tmp_path):
     path = tmp_path / "radar_odometry.csv"
     path.write_text(HAND_ODOMETRY, encoding="utf-8")
     odometry = oxford.load_radar_odometry(path)
-    assert_allclose(odometry.steps, [[2, -1, -1.570796], [3, 0, 0]])  # 1 m right, a quarter turn to the right
+    assert_allclose(
+        odometry.increments, [[2, -1, -1.570796], [3, 0, 0]]
+    )  # 1 m right, a quarter turn to the right
     radar_stamps, mid_stamps, poses = oxford.compose_odometry(odometry)
     assert_array_equal(radar_stamps, [1_000_000, 1_250_000, 1_500_000])
     assert_array_equal(mid_stamps, [1_125_000, 1_375_000, 1_625_000])
     assert_allclose(poses, [[0, 0, 0], [2, -1, -np.pi / 2], [2, -4, -np.pi / 2]], atol=1e-5)
     _, _, moved = oxford.compose_odometry(odometry, start=(10, 0, np.pi / 2))
     assert_allclose(moved, [[10, 0, np.pi / 2], [11, 2, 0], [14, 2, 0]], atol=1e-5)
-    oxford.save_radar_odometry(tmp_path / "again.csv", odometry)
+    oxford_files.save_radar_odometry(tmp_path / "again.csv", odometry)
     assert (tmp_path / "again.csv").read_text(encoding="utf-8") == HAND_ODOMETRY  # minus zeros included
 
 
@@ -601,9 +604,13 @@ def test_odometry_faults_are_named(tmp_path, change, fault):
 def test_odometry_writer_refuses_nan_and_odd_lengths(tmp_path):
     odometry, path = make_odometry(START + np.arange(4) * 250_000), tmp_path / "radar_odometry.csv"
     with pytest.raises(OxfordError, match="line 2: x is missing or not finite"):
-        oxford.save_radar_odometry(path, dataclasses.replace(odometry, steps_6dof=np.full((3, 6), np.nan)))
+        oxford_files.save_radar_odometry(
+            path, dataclasses.replace(odometry, increments_6dof=np.full((3, 6), np.nan))
+        )
     with pytest.raises(OxfordError, match="stamps: expected shape"):
-        oxford.save_radar_odometry(path, dataclasses.replace(odometry, steps_6dof=np.zeros((2, 6))))
+        oxford_files.save_radar_odometry(
+            path, dataclasses.replace(odometry, increments_6dof=np.zeros((2, 6)))
+        )
     assert not path.exists()
 
 
@@ -710,10 +717,10 @@ def test_check_session_names_every_fault(session_root):
     (session_root / "radar" / f"{scans[2]}.png").write_bytes(b"")
     (session_root / "radar" / "notes.txt").write_text("x", encoding="utf-8")
     (session_root / "radar" / f"._{scans[0]}.png").write_bytes(b"x")  # macOS puts it beside a file; no fault
-    oxford.save_timestamps(session_root / "radar.timestamps", scans, scans != scans[3])
+    oxford_files.save_timestamps(session_root / "radar.timestamps", scans, scans != scans[3])
     keep = np.r_[0:4, 8:20]
-    oxford.save_timestamps(session_root / "velodyne_left.timestamps", START + keep * 50_000)
-    oxford.save_radar_odometry(session_root / "gt/radar_odometry.csv", make_odometry(scans[:3]))
+    oxford_files.save_timestamps(session_root / "velodyne_left.timestamps", START + keep * 50_000)
+    oxford_files.save_radar_odometry(session_root / "gt/radar_odometry.csv", make_odometry(scans[:3]))
     (session_root / "gps/gps.csv").unlink()
     session = oxford.open_session(session_root)
     assert_array_equal(session.radar_stamps_us, scans[[0, 1, 2, 4, 5]])  # the stamp flagged 0 is not used
@@ -727,7 +734,7 @@ def test_check_session_names_every_fault(session_root):
         f"velodyne_left.timestamps: 1 gaps between frames, the first: 0.250 s after {START + 150_000}",
         f"velodyne_left: 14 files without a stamp, the first: {START + 200_000}",
         f"velodyne_left: 1 scans without a sweep near, the first: {scans[5]}",
-        f"radar_odometry.csv: 2 scans after the last pose, the truth ends early, the first: {scans[4]}",
+        f"radar_odometry.csv: 2 scans after the last pose, the ground truth ends early, the first: {scans[4]}",
         "gps.csv: file is missing",
     ):
         assert any(expected in fault for fault in faults), (expected, faults)
@@ -738,10 +745,10 @@ def test_check_session_reports_broken_odometry_and_late_truth(session_root):
     scans = START + np.arange(6) * 250_000
     path = session_root / "gt/radar_odometry.csv"
     session = oxford.open_session(session_root)
-    oxford.save_radar_odometry(path, make_odometry(scans[2:5]))
+    oxford_files.save_radar_odometry(path, make_odometry(scans[2:5]))
     assert oxford.check_session(session) == [f"{path}: 2 scans before the first pose, the first: {scans[0]}"]
-    oxford.save_radar_odometry(path, make_odometry(scans[[0, 1, 3, 4]]))
-    assert "1 scans without a pose within the truth's span" in oxford.check_session(session)[0]
+    oxford_files.save_radar_odometry(path, make_odometry(scans[[0, 1, 3, 4]]))
+    assert "1 scans without a pose within the ground truth's span" in oxford.check_session(session)[0]
     path.write_text(path.read_text(encoding="utf-8")[:-20], encoding="utf-8")
     assert oxford.check_session(session)[0].startswith(f"{path}: the last line is cut off")
     path.unlink()

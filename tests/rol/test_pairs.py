@@ -9,8 +9,8 @@ import pytest
 
 from rol import pairs
 from rol.bev import image_to_points
-from rol.geometry import accumulate_steps, exp, relative_pose
-from rol.oxford import EXTRINSICS, RadarScan, Session, save_radar, save_velodyne_binary
+from rol.geometry import accumulate_increments, exp, relative_pose
+from rol.oxford import EXTRINSICS, RadarScan, Session
 from rol.pairs import (
     PairDataset,
     associate_nearest,
@@ -25,6 +25,7 @@ from rol.pairs import (
     save_pair,
     write_pairs,
 )
+from rol_sim.session.oxford_files import save_radar, save_velodyne_binary
 
 STAMP = 1_547_000_000_000_000
 
@@ -62,7 +63,7 @@ def test_associate_refuses():
 
 @dataclass
 class Odometry:
-    steps: np.ndarray
+    increments: np.ndarray
     destination_stamps_us: np.ndarray
     source_stamps_us: np.ndarray
 
@@ -92,11 +93,11 @@ def test_velocities_refuse_broken_chains():
     times = np.arange(4) * 250_000
     good = chain(np.zeros((4, 3)), times)
     with pytest.raises(ValueError, match="no step"):
-        estimate_twists(Odometry(good.steps[:0], times[:0], times[:0]))
+        estimate_twists(Odometry(good.increments[:0], times[:0], times[:0]))
     with pytest.raises(ValueError, match="chain"):
-        estimate_twists(Odometry(good.steps[[0, 2]], times[[0, 2]], times[[1, 3]]))
+        estimate_twists(Odometry(good.increments[[0, 2]], times[[0, 2]], times[[1, 3]]))
     with pytest.raises(ValueError, match="chain"):
-        estimate_twists(Odometry(good.steps, times[1:], times[:-1]))
+        estimate_twists(Odometry(good.increments, times[1:], times[:-1]))
 
 
 def test_real_velocities(real_root):
@@ -104,10 +105,10 @@ def test_real_velocities(real_root):
 
     odometry = load_radar_odometry(real_root / "RadarSLAMPy/data/full_seq_1/gt/radar_odometry.csv")
     twists = estimate_twists(odometry)
-    assert len(twists) == len(odometry.steps) + 1
+    assert len(twists) == len(odometry.increments) + 1
     assert 3.5 < np.hypot(twists[:, 0], twists[:, 1]).mean() < 4.5  # mean speed of the sessions is 4.1 m/s
     assert np.abs(twists[:, 1]).mean() < 0.2 and np.abs(twists[:, 2]).max() < 1.0
-    assert accumulate_steps(odometry.steps).shape == twists.shape
+    assert accumulate_increments(odometry.increments).shape == twists.shape
 
 
 # ---- one pair out of a session

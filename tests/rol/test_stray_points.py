@@ -14,7 +14,7 @@ from rol_beyond.recovery import RecoveringFilter, RecoverySettings
 from rol_beyond.robust import settings_for
 from rol_beyond.search import SearchSettings, search_poses
 from rol_sim.world.mapped import classify_cells
-from rol_study.sampled_points import MapPointsError, look_around
+from rol_study.sampled_points import SampledPointsError, find_visible_points
 
 RNG = np.random.default_rng(1)
 STREET = RNG.uniform(-50.0, 50.0, (200, 2))
@@ -28,7 +28,7 @@ TOLD = r"map: points from x -[45]\d\S* to 1e\+06 m and y -1e\+06 to \S+ m; 1 of 
         build_matched_grid,
         build_likelihood_field,
         Measurement().build_grid,
-        lambda points: look_around(points, np.zeros((1, 3))),
+        lambda points: find_visible_points(points, np.zeros((1, 3))),
         classify_cells,
         lambda points: RecoveringFilter(
             points, np.zeros(3), settings_for("robust"), RecoverySettings(0.2), RNG
@@ -62,8 +62,8 @@ def test_map_file_with_a_stray_point_is_named(tmp_path: Path) -> None:
 
 
 def test_points_that_are_not_finite_are_refused_before_the_grid() -> None:
-    with pytest.raises(MapPointsError, match="not finite"):
-        look_around(np.array([[0.0, np.inf]]), np.zeros((1, 3)))
+    with pytest.raises(SampledPointsError, match="not finite"):
+        find_visible_points(np.array([[0.0, np.inf]]), np.zeros((1, 3)))
 
 
 def test_size_of_a_grid_counts_its_bytes() -> None:

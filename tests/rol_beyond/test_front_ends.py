@@ -57,11 +57,11 @@ def test_unknown_detectors_are_refused() -> None:
 @pytest.mark.parametrize("detector", front_ends.DETECTORS)
 def test_detectors_refuse_scans_that_are_turned_or_no_codes(detector: str) -> None:
     codes, own = scan_with_spot(0.0, 9.0)[:, :576], {"detector": detector, "range_resolution": 0.17}
-    with pytest.raises(ValueError, match="the codes are transposed"):
+    with pytest.raises(ValueError, match="the power is transposed"):
         detect_points(codes.T, AZIMUTHS, **own)
     with pytest.raises(ValueError, match="azimuths must decrease"):
         detect_points(codes, -AZIMUTHS, **own)
-    with pytest.raises(ValueError, match="power codes 0..255"):
+    with pytest.raises(ValueError, match="power 0..255"):
         detect_points(codes / 255, AZIMUTHS, **own)
 
 

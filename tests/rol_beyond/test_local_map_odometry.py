@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial import cKDTree
 
 from rol.evaluation import pose_errors, rmse
-from rol.geometry import accumulate_steps, invert, relative_pose, transform_points
+from rol.geometry import accumulate_increments, invert, relative_pose, transform_points
 from rol.odometry import OdometryError, scan_to_scan_icp, stack_increments
 from rol.radar import DOPPLER_SECONDS, SCAN_SECONDS, peaks_to_points
 from rol_beyond.local_map_odometry import (
@@ -139,7 +139,7 @@ class Drive:
         speed = 6.0 - 6.0 * np.cos(2.0 * np.pi * self.seconds / 14.0)  # 0 to 12 m/s
         self.velocity = np.column_stack([speed, 0.02 * speed * np.sin(self.seconds)])
         steps = np.column_stack([speed * 1e-3, np.zeros_like(speed), self.velocity[:, 1] * 1e-3])
-        self.poses = accumulate_steps(steps[:-1])
+        self.poses = accumulate_increments(steps[:-1])
         self.mid_s = 0.2 + first_s + SCAN_SECONDS * np.arange(n_scans)
         self.stamps_us = np.round(self.mid_s * 1e6).astype(np.int64)
         self.truth = self.at(self.mid_s)
@@ -175,7 +175,7 @@ class Drive:
 
     def end_error(self, steps: np.ndarray) -> float:
         """How far the end is from the true one [m]."""
-        end = accumulate_steps(steps, self.truth[0])[-1]
+        end = accumulate_increments(steps, self.truth[0])[-1]
         return float(np.hypot(*(end - self.truth[-1])[:2]))
 
 

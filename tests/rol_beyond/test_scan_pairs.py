@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 
 from rol.bev import image_to_points
-from rol.oxford import RadarScan, save_radar
+from rol.oxford import RadarScan
 from rol_beyond import scan_pairs
 from rol_beyond.scan_pairs import JoinedPairs, LidarClouds, ScanPairs, turned_radar_image
+from rol_sim.session.oxford_files import save_radar
 
 AZIMUTHS = -2.0 * np.pi * (13 + 14 * np.arange(400)) / 5600
 SETTINGS = {"width": 256, "pixel_size": 0.5, "max_range": 60.0, "motion": "corrected"}

@@ -10,6 +10,7 @@ from scipy.spatial import cKDTree
 pytest.importorskip("torch")
 from safetensors import safe_open
 
+import rol_beyond.unet  # noqa: F401 (registers the architecture)
 from rol.pix2pix import load_network
 from rol_beyond.front_ends import detect_points, judge_on_map, translate_scan
 from rol_data import rall
@@ -39,16 +40,16 @@ def test_weights_are_small_and_have_a_card_that_fits(path: Path) -> None:
 
 
 def test_the_networks_that_chapters_use_are_there() -> None:
-    assert {"rol", "paper", "paper-no-gan"} <= {path.stem for path in WEIGHTS}
+    assert {"unet", "paper", "paper-no-gan"} <= {path.stem for path in WEIGHTS}
 
 
 def test_the_best_network_beats_raw_peaks_on_real_scans_as_its_card_says(real_root: Path) -> None:
-    path = next(path for path in WEIGHTS if path.stem == "rol")
+    path = next(path for path in WEIGHTS if path.stem == "unet")
     translator, tree = load_network(path), cKDTree(rall.load_map_points(real_root / rall.MAP_PATH))
     rows = []
     for scan in rall.load_scans(real_root)[::3]:
-        fake = translate_scan(translator, scan.codes, scan.azimuths, scan.twist)[0]
-        raw = detect_points(scan.codes, scan.azimuths, scan.twist)
+        fake = translate_scan(translator, scan.power, scan.azimuths, scan.twist)[0]
+        raw = detect_points(scan.power, scan.azimuths, scan.twist)
         rows.append([judge_on_map(points, scan.pose, tree)["share_1m"] for points in (fake, raw)])
         assert len(fake) >= 300
     fake_share, raw_share = np.mean(rows, axis=0)

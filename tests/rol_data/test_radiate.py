@@ -35,7 +35,7 @@ def test_axes_and_times_of_a_pair(tmp_path: Path) -> None:
     (pair,) = radiate.load_pairs(tmp_path)
     assert pair.lidar_path.name == "000008.csv" and pair.gap_s == pytest.approx(0.05)
     np.testing.assert_allclose(pair.points[0], [8.0 - 0.25, -1.0 - 0.5, 3.125, 4.0])
-    assert pair.codes.shape == (400, 576) and pair.codes[100, 120] == 200
+    assert pair.power.shape == (400, 576) and pair.power[100, 120] == 200
     assert radiate.radiate_azimuths()[100] == pytest.approx(-0.5 * np.pi)  # a quarter turn clockwise
 
 
@@ -65,4 +65,4 @@ def test_faults_are_named(tmp_path: Path, name: str, content: bytes | None, faul
 def test_the_real_sample(real_root: Path) -> None:
     pairs = radiate.load_pairs(real_root)
     assert len(pairs) == 18 and max(abs(pair.gap_s) for pair in pairs) < 0.15
-    assert all(pair.codes.max() > 100 and len(pair.points) > 10_000 for pair in pairs)
+    assert all(pair.power.max() > 100 and len(pair.points) > 10_000 for pair in pairs)

@@ -36,7 +36,7 @@ def test_real_scan_poses(real_root: Path) -> None:
 def test_real_scans_come_with_pose_and_velocity(real_root: Path, tmp_path: Path) -> None:
     scans = rall.load_scans(real_root)
     assert [scan.stamp_us for scan in scans] == sorted(scan.stamp_us for scan in scans) and len(scans) == 11
-    assert scans[0].codes.shape == (400, 3768) and scans[0].path.stem == str(scans[0].stamp_us)
+    assert scans[0].power.shape == (400, 3768) and scans[0].path.stem == str(scans[0].stamp_us)
     for before, after in pairwise(scans):
         seconds = (after.stamp_us - before.stamp_us) * 1e-6
         speed = np.hypot(*(after.pose - before.pose)[:2]) / seconds

@@ -25,7 +25,7 @@ from rol_beyond.resampling import KldResampling
 from rol_beyond.scan_matching import ScanToMapSettings
 from rol_sim.sensors.radar import RadarSettings
 from rol_sim.session.settings import SessionSettings, SettingsError, SimulationSettings
-from rol_study.sampled_points import FrontEnd, MapPointsError
+from rol_study.sampled_points import FrontEnd, SampledPointsError
 
 NEEDED = {
     "RecoverySettings": {"reference_contrast": 0.2},
@@ -137,7 +137,7 @@ def test_the_classes_are_all_there() -> None:
         (TrainConfig, {"beta1": 1.0}, Pix2PixError, "beta1: 1.0 is not in"),
         (TrainConfig, {"network": "vnet"}, Pix2PixError, "network: 'vnet' is none of resnet, unet"),
         (TrainConfig, {"pixel_loss": "l2"}, Pix2PixError, "pixel_loss: 'l2' is none of l1, entropy"),
-        (FrontEnd, {"share_1m": 40.0}, MapPointsError, "share_1m: 40.0 is not in"),
+        (FrontEnd, {"share_1m": 40.0}, SampledPointsError, "share_1m: 40.0 is not in"),
         (RadarSettings, {"layer_widths_deg": (0.8, 0.0)}, ValueError, "layer_widths_deg: .* is not in"),
         (SimulationSettings, {"loop_m": 10.0}, SettingsError, r"loop_m: 10.0 is not in \[450, inf\)"),
         (SessionSettings, {"changed_share": 0.4}, SettingsError, r"changed_share: 0.4 is not in \[0, 0.3\]"),

@@ -17,10 +17,10 @@ import yaml
 from rol import oxford
 from rol.geometry import relative_pose
 from rol_data import rall
-from rol_sim.drive import recorded as route
+from rol_sim.drive import recorded_poses
 from rol_sim.session import writer
-from rol_sim.session.assembly import build_session, build_twins, make_scan
 from rol_sim.session.settings import SettingsError, load_settings, parse_settings
+from rol_sim.session.simulation import build_session, build_twins, make_scan
 from rol_sim.world import mapped
 from rol_sim.world.mesh import Material
 
@@ -159,7 +159,7 @@ def test_pieces_have_the_heights_and_materials_of_their_kind() -> None:
 
 def test_drive_goes_through_the_poses_and_stands_where_they_stand() -> None:
     poses, stamps = drive_poses(), 10**15 + 250_000 * np.arange(12)
-    drive = route.interpolate_drive(stamps, poses)
+    drive = recorded_poses.interpolate_trajectory(stamps, poses)
     np.testing.assert_allclose(drive.pose(stamps), poses, atol=1e-3)
     assert np.abs(drive.speeds[(drive.stamps_us < stamps[2])]).max() < 0.3
     np.testing.assert_allclose(drive.velocity(stamps[9:10])[0], (poses[10] - poses[8])[:2] / 0.5, atol=0.15)
@@ -170,15 +170,15 @@ def test_nobody_stands_or_drives_in_the_way() -> None:
     n = 400
     poses = np.column_stack([2.0 * np.arange(n), np.zeros(n), np.zeros(n)])
     stamps = 10**15 + 250_000 * np.arange(n)
-    drive, rng = route.interpolate_drive(stamps, poses), np.random.default_rng(2)
+    drive, rng = recorded_poses.interpolate_trajectory(stamps, poses), np.random.default_rng(2)
     taken = np.column_stack(
         [np.arange(0.0, 400.0, 0.5), np.full(800, 2.4)]
     )  # no room at the first kerb there
-    parked = route.park_vehicles(drive, taken, rng, parked_share=1.0, first_object=50)
+    parked = recorded_poses.park_vehicles(drive, taken, rng, parked_share=1.0, first_object=50)
     x, y = parked.vertices[:, 0], parked.vertices[:, 1]
     assert np.abs(y).min() > 1.1 and not ((y > 0.0) & (x > 5.0) & (x < 395.0)).any()
     assert parked.objects.min() == 50 and len(np.unique(parked.objects)) > 100
-    traffic = route.plan_encounters(drive, rng, vehicles_per_min=20, people_per_min=10)
+    traffic = recorded_poses.plan_encounters(drive, rng, vehicles_per_min=20, people_per_min=10)
     met = 0
     for stamp in stamps[::4]:
         own = drive.pose(np.array([stamp]))[0]
@@ -191,7 +191,7 @@ def test_nobody_stands_or_drives_in_the_way() -> None:
             assert apart[0] > 2.2 + size[0] - 0.5 or apart[1] > 0.9 + size[1] - 0.4
     assert met > 20
     assert len(traffic.bodies_at(stamps[0] - 60_000_000, poses[0])[0]) == 0
-    quiet = route.plan_encounters(drive, rng, vehicles_per_min=0, people_per_min=0)
+    quiet = recorded_poses.plan_encounters(drive, rng, vehicles_per_min=0, people_per_min=0)
     assert len(quiet.bodies_at(stamps[100], poses[100], 8.0)[0]) == 0
 
 
@@ -208,7 +208,7 @@ def test_route_session_is_read_back_as_it_was_made(small_root: Path, tmp_path: P
         str(folder / "radar" / f"{stamp}.png"), cv2.IMREAD_GRAYSCALE
     )  # the official rules, by hand
     scan = make_scan(made, 7)
-    np.testing.assert_array_equal(raw[:, 11:], scan.codes)
+    np.testing.assert_array_equal(raw[:, 11:], scan.power)
     np.testing.assert_array_equal(np.ascontiguousarray(raw[:, :8]).view("<i8").ravel(), scan.row_stamps_us)
     np.testing.assert_array_equal(
         np.ascontiguousarray(raw[:, 8:10]).view("<u2").ravel(), 13 + 14 * np.arange(400)

@@ -12,11 +12,11 @@ import pytest
 pytest.importorskip("open3d")
 from rol import oxford
 from rol.evaluation import read_tum
-from rol.geometry import accumulate_steps, compose, invert, transform_points
+from rol.geometry import accumulate_increments, compose, invert, transform_points
 from rol_sim.__main__ import main
 from rol_sim.session import logs, writer
-from rol_sim.session.assembly import build_session, label_sweep, list_labels
 from rol_sim.session.settings import SettingsError, load_settings, parse_settings, read_settings
+from rol_sim.session.simulation import build_session, label_sweep, list_labels
 from rol_sim.world.mesh import GROUND_MATERIALS, Material
 
 pytestmark = pytest.mark.open3d
@@ -179,11 +179,11 @@ def test_odometry_drifts_a_little() -> None:
     t = np.linspace(0.0, 1.0, 241)
     truth = np.column_stack([120 * np.cos(3.3 * t), 120 * np.sin(3.3 * t), 3.3 * t + np.pi / 2])
     exact = logs.drift_odometry(truth, _Silent(), scale_spread=0.0, yaw_spread_rad=0.0)
-    np.testing.assert_allclose(accumulate_steps(exact, truth[0])[:, :2], truth[:, :2], atol=1e-9)
+    np.testing.assert_allclose(accumulate_increments(exact, truth[0])[:, :2], truth[:, :2], atol=1e-9)
     ends = [
         np.hypot(
             *(
-                accumulate_steps(logs.drift_odometry(truth, np.random.default_rng(k)), truth[0])[-1]
+                accumulate_increments(logs.drift_odometry(truth, np.random.default_rng(k)), truth[0])[-1]
                 - truth[-1]
             )[:2]
         )
@@ -211,7 +211,7 @@ def test_session_is_a_whole_oxford_session(folder: Path) -> None:
     for stamp in session.radar_stamps_us:
         scan = oxford.load_radar(session.radar_path(stamp))
         assert scan.counters[[0, 1, -1]].tolist() == [13, 27, 5599] and (scan.valid == 255).all()
-        assert 0.001 < (scan.codes >= 80).mean() < 0.05
+        assert 0.001 < (scan.power >= 80).mean() < 0.05
         for sensor, stamps in zip(
             writer.LIDARS, (session.left_stamps_us, session.right_stamps_us), strict=True
         ):
@@ -230,7 +230,7 @@ def stamps_of(folder: Path, sensor: str = "velodyne_left") -> np.ndarray:
 
 def test_odometry_follows_the_truth(folder: Path) -> None:
     odometry = oxford.load_radar_odometry(folder / "gt" / "radar_odometry.csv")
-    assert len(odometry.steps) == 4 - 2
+    assert len(odometry.increments) == 4 - 2
     stamps, middles, poses = oxford.compose_odometry(odometry)
     true_stamps, truth = read_tum(folder / "truth.tum")
     np.testing.assert_array_equal(true_stamps[:-1], stamps)

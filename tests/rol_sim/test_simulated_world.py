@@ -8,7 +8,7 @@ pytest.importorskip("open3d")
 from rol.geometry import compose
 from rol.oxford import EXTRINSICS, VelodyneRaw, velodyne_raw_to_points
 from rol_sim.drive import traffic
-from rol_sim.drive.planned import Route, build_route, plan_drive
+from rol_sim.drive.town_loop import Route, build_route, plan_trajectory
 from rol_sim.sensors import lidar as lidar_sensor
 from rol_sim.sensors.lidar import LidarSettings, schedule_firings, simulate_sweep
 from rol_sim.world import town as world
@@ -30,7 +30,7 @@ def town() -> world.Town:
 
 @pytest.fixture(scope="module")
 def drive(town: world.Town):
-    return plan_drive(build_route(town.plan), STAMP, 40.0, np.random.default_rng(5))
+    return plan_trajectory(build_route(town.plan), STAMP, 40.0, np.random.default_rng(5))
 
 
 def wall(x: float, material: int, number: int):
@@ -87,17 +87,15 @@ def test_moving_bodies_share_the_standing_scene() -> None:
     assert behind.cast(ray).material[0] == Material.FACADE
 
 
-def test_all_hits_are_sorted() -> None:
+def test_first_hits_of_standing_and_moving_walls() -> None:
     scene = Scene([wall(9.0, Material.WALL, 2), wall(5.0, Material.FACADE, 1)])
     scene = scene.with_moving(wall(7.0, Material.VEHICLE, 3))
     slanted = np.array([0.8, 0.0, 0.6])
-    rays = np.array([[0, 0.3, 0.1, 1, 0, 0], [0, 9, 0, 1, 0, 0], [4.2, 0.3, -0.5, *slanted]])
-    found = scene.cast_through(rays, max_t=8.0)
-    assert found.ray_index.tolist() == [0, 0, 2]
-    np.testing.assert_allclose(found.t, [5.0, 7.0, 1.0], rtol=1e-6)
-    assert found.material.tolist() == [Material.FACADE, Material.VEHICLE, Material.FACADE]
-    np.testing.assert_allclose(found.cos_incidence, [1, 1, 0.8], atol=1e-6)
-    assert len(scene.cast_through(rays[1:2]).t) == 0
+    rays = np.array([[5.5, 0.3, 0.1, 1, 0, 0], [0, 9, 0, 1, 0, 0], [4.2, 0.3, -0.5, *slanted]])
+    found = scene.cast(rays)
+    np.testing.assert_allclose(found.t, [1.5, np.inf, 1.0], rtol=1e-6)
+    assert found.material.tolist() == [Material.VEHICLE, Material.NONE, Material.FACADE]
+    np.testing.assert_allclose(found.cos_incidence, [1, 0, 0.8], atol=1e-6)
 
 
 def test_scene_refuses_nonsense() -> None:
@@ -229,7 +227,7 @@ def test_no_direction_is_empty(town: world.Town) -> None:
 
 
 def test_sessions_dress_the_town_differently(town: world.Town) -> None:
-    first, other = (world.dress(town, np.random.default_rng(k)) for k in (1, 2))
+    first, other = (world.add_session_objects(town, np.random.default_rng(k)) for k in (1, 2))
     assert len(first.triangles) != len(other.triangles)
     assert first.objects.min() == town.mesh.objects.max() + 1
     found = {Material(number) for number in np.unique(first.materials)}
@@ -240,7 +238,7 @@ def test_sessions_dress_the_town_differently(town: world.Town) -> None:
         Material.TREE_TRUNK,
         Material.METAL,
     }
-    bare = world.dress(town, np.random.default_rng(1), parked_share=0.0, leaf_density=0.5)
+    bare = world.add_session_objects(town, np.random.default_rng(1), parked_share=0.0, leaf_density=0.5)
     assert not (bare.materials == Material.VEHICLE).any()
     ratio = (bare.materials == Material.TREE_CROWN).sum() / (first.materials == Material.TREE_CROWN).sum()
     assert 0.45 < ratio < 0.55
@@ -285,7 +283,7 @@ def test_drive_obeys_physics(town: world.Town, drive) -> None:
 def test_drive_stops_on_the_way(town: world.Town) -> None:
     route = build_route(town.plan)
     for stops in (0, 1, 2):
-        d = plan_drive(route, STAMP, 60.0, np.random.default_rng(2), n_stops=stops, stand_s=1.0)
+        d = plan_trajectory(route, STAMP, 60.0, np.random.default_rng(2), n_stops=stops, stand_s=1.0)
         is_standing = d.speeds < 0.02
         begins = np.flatnonzero(is_standing[1:] & ~is_standing[:-1])
         assert len(begins) == stops
@@ -294,7 +292,8 @@ def test_drive_stops_on_the_way(town: world.Town) -> None:
 def test_sessions_start_a_few_metres_apart(town: world.Town) -> None:
     route = build_route(town.plan)
     starts = [
-        plan_drive(route, STAMP, 5.0, np.random.default_rng(k), start_m=20.0).progress[0] for k in range(12)
+        plan_trajectory(route, STAMP, 5.0, np.random.default_rng(k), start_m=20.0).progress[0]
+        for k in range(12)
     ]
     offsets = np.abs(np.array(starts) - 20.0)
     assert offsets.min() >= 1.0 and offsets.max() <= 4.0
@@ -309,7 +308,7 @@ def test_drive_interpolates_and_refuses_times_outside(drive) -> None:
         drive.pose(np.array([drive.stamps_us[-1] + 1]))
     route = Route(np.zeros((4, 2)), 1.0, np.zeros(0))
     with pytest.raises(ValueError, match="must be positive"):
-        plan_drive(route, STAMP, -1.0, np.random.default_rng(0))
+        plan_trajectory(route, STAMP, -1.0, np.random.default_rng(0))
 
 
 def test_nobody_drives_through_the_car(town: world.Town, drive) -> None:

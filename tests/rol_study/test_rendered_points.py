@@ -15,7 +15,7 @@ from rol.pix2pix import TrainedNetwork
 from rol_beyond import front_ends
 from rol_beyond.front_ends import detect_points, judge_on_map
 from rol_data import rall
-from rol_study.rendered_points import build_stretch, render_clouds, true_twists
+from rol_study.rendered_points import build_segment, render_points, true_twists
 
 pytestmark = pytest.mark.open3d
 QUIET = {"vehicles": 0, "people": 0, "parked_share": 0.0}
@@ -63,7 +63,7 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
 
 def test_clouds_lie_on_the_map_at_their_poses(small_root: Path, asked: list[Any]) -> None:
     tree = cKDTree(rall.load_map_points(small_root / rall.MAP_PATH))
-    clouds = render_clouds(small_root, "02", 4, 5, NOBODY, 3, bf16=True, headings=2, **QUIET)
+    clouds = render_points(small_root, "02", 4, 5, NOBODY, 3, bf16=True, headings=2, **QUIET)
     assert isinstance(clouds, Iterator) and not asked  # nothing is rendered before it is asked for
     poses = drive_poses()[4:9]
     right, wrong = ([], [])
@@ -81,7 +81,7 @@ def test_clouds_lie_on_the_map_at_their_poses(small_root: Path, asked: list[Any]
 
 def test_a_seed_gives_the_same_clouds_one_scan_at_a_time(small_root: Path, asked: list[Any]) -> None:
     def take(number: str, seed: int) -> list[np.ndarray]:
-        return list(itertools.islice(render_clouds(small_root, number, 0, 12, NOBODY, seed), 2))
+        return list(itertools.islice(render_points(small_root, number, 0, 12, NOBODY, seed), 2))
 
     one, again, other, day = take("02", 3), take("02", 3), take("02", 4), take("07", 3)
     assert len(asked) == 8  # two of twelve each time
@@ -91,7 +91,7 @@ def test_a_seed_gives_the_same_clouds_one_scan_at_a_time(small_root: Path, asked
 
 
 def test_velocities_are_those_of_the_poses(small_root: Path) -> None:
-    session = build_stretch(small_root, "02", 0, 0, 3, **QUIET)
+    session = build_segment(small_root, "02", 0, 0, 3, **QUIET)
     twists = true_twists(session)
     assert len(twists) == 12
     middles = session.scans_us + session.turns_us // 2
@@ -114,14 +114,14 @@ def test_scans_that_are_not_there_are_refused_at_once(
     small_root: Path, number: str, first: int, n: int, fault: str
 ) -> None:
     with pytest.raises(ValueError, match=fault):
-        render_clouds(small_root, number, first, n, NOBODY, 3)
+        render_points(small_root, number, first, n, NOBODY, 3)
 
 
 def test_other_faults_are_named(small_root: Path, tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="no real data in"):
-        render_clouds(tmp_path, "02", 0, 3, NOBODY, 3)
+        render_points(tmp_path, "02", 0, 3, NOBODY, 3)
     with pytest.raises(ValueError, match="unknown key 'clouds'"):
-        render_clouds(small_root, "02", 0, 3, NOBODY, 3, clouds=1)
+        render_points(small_root, "02", 0, 3, NOBODY, 3, clouds=1)
 
 
 @pytest.mark.torch
@@ -133,6 +133,6 @@ def test_an_untrained_network_on_the_real_route(real_root: Path) -> None:
     generator = build_generator(2, 1, rng=torch.Generator().manual_seed(1))
     generator.image_size = (512, 512)
     translator = TrainedNetwork(generator, {"threshold": 1}, {}, {})
-    clouds = list(render_clouds(real_root, "02", 6000, 3, translator, 3))
+    clouds = list(render_points(real_root, "02", 6000, 3, translator, 3))
     assert len(clouds) == 3 and all(len(cloud) > 100 for cloud in clouds)
     assert max(np.abs(cloud).max() for cloud in clouds) < 64.0 * np.sqrt(2.0)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from rol.evaluation import FailureMonitor, pose_errors, rmse, summarize
-from rol.geometry import accumulate_steps, compose, relative_pose
+from rol.geometry import accumulate_increments, compose, relative_pose
 from rol.maps import accumulate_map, register_maps
 from rol.mcl import MclSettings, ParticleFilter, localize
 from rol.odometry import scan_to_scan_icp, stack_increments
@@ -31,7 +31,7 @@ def drive(offset: tuple[float, float, float], step_m: float) -> np.ndarray:
     straight = [(step_m, 0.0, 0.0)] * int(100 / step_m)
     bend = [(step_m, 0.0, step_m / 10.0)] * round(np.pi / 2 * 10.0 / step_m)
     increments = np.array((straight + bend) * 2 + straight)
-    return accumulate_steps(increments, compose((70.0, 60.0, 0.0), offset))
+    return accumulate_increments(increments, compose((70.0, 60.0, 0.0), offset))
 
 
 def scan(walls: np.ndarray, pose: np.ndarray, rng: np.random.Generator, clutter: int = 60) -> np.ndarray:
@@ -98,7 +98,7 @@ def test_filter_follows_the_second_drive_on_the_map_of_the_first(town, method):
     assert metrics["rmse_m"] < 0.5 and metrics["rmse_yaw_deg"] < 1.0
     assert pose_errors(poses[-1:], truth[-1:]).position_m[0] < 0.5
     # and it beats the odometry that it is fed with
-    alone = pose_errors(accumulate_steps(increments, truth[0]), truth)
+    alone = pose_errors(accumulate_increments(increments, truth[0]), truth)
     assert metrics["rmse_m"] < rmse(alone.position_m)
 
 

@@ -9,22 +9,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from rol.geometry import check_fields
+from rol.oxford import ELEVATIONS_DOWN, FIRE_HEIGHT, RANGE_UNIT
+from rol_sim.world.mesh import Material
+from rol_sim.world.scene import Scene
 
-if TYPE_CHECKING:
-    from rol_sim.world.scene import Scene
-
-ELEVATIONS_DOWN = np.array([
-    -0.1862, -0.1628, -0.1396, -0.1164, -0.0930, -0.0698, -0.0466, -0.0232, 0.0, 0.0232, 0.0466, 0.0698,
-    0.0930, 0.1164, 0.1396, 0.1628, 0.1862, 0.2094, 0.2327, 0.2560, 0.2793, 0.3025, 0.3259, 0.3491,
-    0.3723, 0.3957, 0.4189, 0.4421, 0.4655, 0.4887, 0.5119, 0.5353,
-])  # fmt: skip
-FIRE_HEIGHT = 0.090805  # from the lidar frame's origin up to the centre of the lasers [m]
-RANGE_UNIT = 0.002  # [m] per count of the raw file
 FIRING_US = 46.08  # time between two firings of the same laser
 FIRINGS_PER_PACKET = 12
 TURN_US = 50_000.0
@@ -107,8 +99,6 @@ class Sweep:
 @lru_cache
 def surface_table() -> np.ndarray:
     """Give the rows of `SURFACES` in the order of `Material`, shape (n_materials, 3)."""
-    from rol_sim.world.mesh import Material
-
     return np.array([SURFACES.get(m.name, (0.0, 1.0, 0.0)) for m in Material], dtype=np.float32)
 
 

@@ -5,16 +5,12 @@ Everything here is drawn from given generators and the true drive; nothing is wr
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
+import pandas as pd
+from scipy.signal import lfilter
 
 from rol.geometry import relative_pose
-
-if TYPE_CHECKING:
-    import pandas as pd
-
-    from rol_sim.drive.planned import Drive
+from rol_sim.drive.town_loop import Drive
 
 N_ROWS = 400
 SWEEP_US = 50_000
@@ -183,8 +179,6 @@ def draw_gps(drive: Drive, rng: np.random.Generator) -> pd.DataFrame:
     table : pandas.DataFrame
         Columns of Oxford's gps.csv.
     """
-    import pandas as pd
-
     stamps = np.arange(drive.stamps_us[0], drive.stamps_us[-1], 200_010, dtype=np.int64)
     error = _slow_error(len(stamps), 0.985, rng) * (0.7, 0.7, 1.0)
     east, north, up = (_place(drive, stamps) + error).T
@@ -211,8 +205,6 @@ def draw_ins(drive: Drive, rng: np.random.Generator) -> pd.DataFrame:
     table : pandas.DataFrame
         Columns of Oxford's ins.csv; the vehicle frame is pitched by 0.05 rad against the level radar.
     """
-    import pandas as pd
-
     stamps = np.arange(drive.stamps_us[0], drive.stamps_us[-1], 20_000, dtype=np.int64)
     count = len(stamps)
     error = _slow_error(count, 0.9995, rng) * (0.5, 0.5, 0.6)
@@ -241,8 +233,6 @@ def _place(drive: Drive, stamps_us: np.ndarray) -> np.ndarray:
 
 def _slow_error(count: int, memory: float, rng: np.random.Generator) -> np.ndarray:
     """Three errors of spread 1 that change slowly, shape (count, 3)."""
-    from scipy.signal import lfilter
-
     noise = rng.normal(0.0, 1.0, (count, 3)) * np.sqrt(1.0 - memory**2)
     noise[0] /= np.sqrt(1.0 - memory**2)
     return lfilter([1.0], [1.0, -memory], noise, axis=0)

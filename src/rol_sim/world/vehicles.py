@@ -5,12 +5,10 @@ Frames as in `shapes`: origin on the ground in the middle of the body, x forward
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
-if TYPE_CHECKING:
-    from rol_sim.world.mesh import Mesh
+from rol_sim.world.mesh import Material, Mesh, merge_meshes
+from rol_sim.world.shapes import build_box, build_cylinder, build_quads
 
 # Side views (x, z), clockwise from the lower front corner, before scaling by length and height; the two
 # numbers after them are the first and the last corner of the glazed part.
@@ -59,9 +57,6 @@ def build_vehicle(kind: str, rng: np.random.Generator) -> Mesh:
     mesh : Mesh
         VEHICLE body with GLASS panes.
     """
-    from rol_sim.world.mesh import Material, merge_meshes
-    from rol_sim.world.shapes import build_box, build_quads
-
     (length, width, height), spread = _SIZES[kind]
     length, width, height = np.array([length, width, height]) * np.clip(
         rng.normal(1.0, spread, 3), 0.85, 1.15
@@ -96,9 +91,6 @@ def draw_kind(kinds: tuple[tuple[str, float], ...], rng: np.random.Generator) ->
 
 def build_cyclist(rng: np.random.Generator) -> Mesh:
     """Make a person on a bicycle."""
-    from rol_sim.world.mesh import Material, merge_meshes
-    from rol_sim.world.shapes import build_box, build_cylinder
-
     lean = float(rng.uniform(0.1, 0.3))
     rider = build_cylinder(0.2, 0.8, float(rng.uniform(1.6, 1.8)), Material.PERSON, lean=lean)
     frame = build_box(-0.8, 0.8, -0.02, 0.02, 0.35, 0.75, Material.METAL)
@@ -108,9 +100,6 @@ def build_cyclist(rng: np.random.Generator) -> Mesh:
 
 def build_pedestrian(rng: np.random.Generator) -> Mesh:
     """Make a person on foot."""
-    from rol_sim.world.mesh import Material
-    from rol_sim.world.shapes import build_cylinder
-
     return build_cylinder(
         float(rng.uniform(0.18, 0.26)), 0.0, float(rng.uniform(1.5, 1.9)), Material.PERSON, sides=6
     )
@@ -136,9 +125,6 @@ def build_furniture(kind: str, rng: np.random.Generator) -> Mesh:
     ValueError
         If the kind is not known.
     """
-    from rol_sim.world.mesh import Material, merge_meshes
-    from rol_sim.world.shapes import build_box, build_cylinder, build_quads
-
     metal = Material.METAL
     if kind == "lamp":
         tall = float(rng.uniform(5.0, 8.0))

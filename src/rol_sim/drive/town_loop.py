@@ -8,19 +8,16 @@ frame (x, y, yaw).
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
 
 from rol.geometry import wrap_angle
-
-if TYPE_CHECKING:
-    from rol_sim.world.streets import StreetPlan
+from rol_sim.world.streets import StreetPlan
 
 LATERAL_ACCELERATION = 1.8  # [m/s^2]
 ACCELERATION, BRAKING = 1.3, 1.7  # [m/s^2]
-STEP_US = 5_000  # truth is kept at 200 Hz
+POSE_STEP_US = 5_000  # truth is kept at 200 Hz
 
 
 @dataclass(frozen=True)
@@ -160,7 +157,7 @@ def build_route(plan: StreetPlan, *, rounding: float = 5.5, spacing: float = 0.2
     return Route(points, gap, np.sort(np.array(nearest) * gap))
 
 
-def plan_drive(
+def plan_trajectory(
     route: Route,
     first_stamp_us: int,
     duration_s: float,
@@ -216,13 +213,13 @@ def plan_drive(
     limit = np.minimum(limit, np.sqrt(LATERAL_ACCELERATION / np.maximum(curvature, 1e-4)))
     stops = _choose_stops(route, start, n_stops, rng, reach=5.0 * duration_s)
     times = _time_of_arrival(along, s, limit, stops, 1.0 + stand_s)
-    count, spare = int((duration_s + 2.0) * 1e6 / STEP_US) + 1, 400
-    grid = STEP_US * 1e-6 * np.arange(count + spare)
+    count, spare = int((duration_s + 2.0) * 1e6 / POSE_STEP_US) + 1, 400
+    grid = POSE_STEP_US * 1e-6 * np.arange(count + spare)
     travelled = np.interp(grid, times.ravel(), np.repeat(along, 2))
-    travelled = gaussian_filter1d(travelled, 0.25e6 / STEP_US, mode="nearest")  # no sudden jerks
-    speeds, travelled = np.gradient(travelled, STEP_US * 1e-6)[:count], travelled[:count]
+    travelled = gaussian_filter1d(travelled, 0.25e6 / POSE_STEP_US, mode="nearest")  # no sudden jerks
+    speeds, travelled = np.gradient(travelled, POSE_STEP_US * 1e-6)[:count], travelled[:count]
     poses = np.stack([np.interp(travelled, along, v) for v in (line[:, 0], line[:, 1], yaw)], axis=-1)
-    stamps = first_stamp_us - 1_000_000 + STEP_US * np.arange(count, dtype=np.int64)
+    stamps = first_stamp_us - 1_000_000 + POSE_STEP_US * np.arange(count, dtype=np.int64)
     return Drive(stamps, poses, speeds, np.interp(travelled, along, s))
 
 

@@ -10,21 +10,26 @@ from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 from functools import lru_cache, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import cv2
 import numpy as np
 
-if TYPE_CHECKING:
-    from rol.oxford import RadarScan
-    from rol_sim.drive.planned import Drive
-    from rol_sim.drive.traffic import Traffic
-    from rol_sim.sensors.lidar import LidarSettings, Sweep
-    from rol_sim.sensors.radar import RadarSettings
-    from rol_sim.session.settings import SessionSettings, SimulationSettings
-    from rol_sim.world.mapped import Cells
-    from rol_sim.world.mesh import Mesh
-    from rol_sim.world.scene import Scene
-    from rol_sim.world.town import Town
+from rol.maps import thin_points
+from rol.oxford import EXTRINSICS, RANGE_UNIT, RadarScan, load_velodyne_raw, velodyne_raw_to_points
+from rol_data import rall
+from rol_sim.drive.recorded_poses import interpolate_trajectory, park_vehicles, plan_encounters
+from rol_sim.drive.town_loop import Drive, build_route, plan_trajectory
+from rol_sim.drive.traffic import Traffic, plan_traffic
+from rol_sim.sensors.lidar import LidarSettings, Sweep, schedule_firings, simulate_sweep
+from rol_sim.sensors.radar import RadarSettings, simulate_scan
+from rol_sim.session import logs
+from rol_sim.session.settings import SessionSettings, SettingsError, SimulationSettings, describe
+from rol_sim.world import mapped
+from rol_sim.world.mapped import Cells, classify_cells, draw_unmapped
+from rol_sim.world.mesh import Mesh, merge_meshes
+from rol_sim.world.scene import Scene
+from rol_sim.world.town import Town, add_session_objects, build_town
 
 LIDARS = ("velodyne_left", "velodyne_right")
 FIRST_COUNT, COUNT_STEP = 13, 14  # encoder counts of the radar's rows: 13, 27, ... 5599 of 5600
@@ -32,7 +37,7 @@ WORLD_RADIUS_M = 180.0  # how far from the drive a world grown from a map reache
 CAR_M = 1.8  # so near to where the car drives stands nothing, whatever the map says
 CLEAR_M = 3.0  # what the map does not show stays so far from there
 # Parts of a session that draw from generators of their own.
-DRESS, DRIVE, TRAFFIC, SCANS, SWEEPS, ODOMETRY, GPS, INS, SCAN, SWEEP = range(10)
+OBJECTS, DRIVE, TRAFFIC, SCANS, SWEEPS, ODOMETRY, GPS, INS, SCAN, SWEEP = range(10)
 
 
 @dataclass(frozen=True)
@@ -116,10 +121,6 @@ def build_session(settings: SimulationSettings, name: str) -> SimulatedSession:
     SettingsError
         If there is no such session.
     """
-    from rol_sim.session import logs
-    from rol_sim.session.settings import describe
-    from rol_sim.world.scene import Scene
-
     describe(settings, name)  # a clear error if there is no such session
     own, rng = settings.sessions[name], partial(_generator, settings, name)
     given = load_route(settings, own) if settings.world == "route" else None
@@ -159,9 +160,6 @@ def load_route(settings: SimulationSettings, own: SessionSettings) -> np.ndarray
     SettingsError
         If the real data are not there, or the file holds too few poses.
     """
-    from rol_data import rall
-    from rol_sim.session.settings import SettingsError
-
     root = rall.find_real_root(settings.real_root)
     if root is None:
         raise SettingsError(
@@ -181,19 +179,14 @@ def _find_town(
     settings: SimulationSettings, own: SessionSettings, scans: np.ndarray, turns: np.ndarray, rng: Callable
 ) -> tuple[Town, Callable[[np.ndarray], np.ndarray], Mesh, Drive, Traffic]:
     """The town as one session finds it, and who is on the move."""
-    from rol_sim.drive.planned import build_route, plan_drive
-    from rol_sim.drive.traffic import plan_traffic
-    from rol_sim.world.mesh import merge_meshes
-    from rol_sim.world.town import dress
-
     town = _build_town(settings.seed, settings.loop_m, settings.relief_m)
-    standing = dress(
-        town, rng(DRESS), parked_share=own.parked_share, leaf_density=own.leaf_density,
+    standing = add_session_objects(
+        town, rng(OBJECTS), parked_share=own.parked_share, leaf_density=own.leaf_density,
         changed_share=own.changed_share,
     )  # fmt: skip
     route = build_route(town.plan)
     duration_s = float(scans[-1] + turns[-1] - scans[0]) * 1e-6
-    drive = plan_drive(
+    drive = plan_trajectory(
         route, int(scans[0]), duration_s, rng(DRIVE),
         start_m=settings.start_m, cruise_mps=own.cruise_mps, n_stops=own.stops, stand_s=own.stand_s,
     )  # fmt: skip
@@ -211,23 +204,17 @@ def _find_route(
     rng: Callable,
 ) -> tuple[Mesh, Drive, Traffic]:
     """The world of the map as one session finds it, and who is on the move."""
-    from rol.maps import thin_points
-    from rol_data import rall
-    from rol_sim.drive.recorded import interpolate_drive, park_vehicles, plan_encounters
-    from rol_sim.world import mapped
-    from rol_sim.world.mesh import merge_meshes
-
     places = thin_points(poses[:, :2], 2.0)[0]
     path = str(rall.find_real_root(settings.real_root) / rall.MAP_PATH)
     whole, unmapped = _read_map(path, settings.seed, settings.unmapped_share)
     cells = mapped.crop_cells(whole, places, WORLD_RADIUS_M)
     lane = thin_points(poses[:, :2], 0.5)[0]
-    later = mapped.change_cells(cells, rng(DRESS), missing_share=own.changed_share)
+    later = mapped.change_cells(cells, rng(OBJECTS), missing_share=own.changed_share)
     left = mapped.join_cells(
         mapped.crop_cells(later, lane, WORLD_RADIUS_M, clear_m=CAR_M),  # the map keeps traces of traffic
         mapped.crop_cells(unmapped, lane, WORLD_RADIUS_M, clear_m=CLEAR_M),
     )
-    drive = interpolate_drive(middles_us, poses)
+    drive = interpolate_trajectory(middles_us, poses)
     things = [
         mapped.build_ground(places, WORLD_RADIUS_M),
         mapped.build_pieces(left, settings.seed, leaf_density=own.leaf_density),
@@ -265,10 +252,6 @@ def build_twins(real_root: Path | str, seed: int = 1, margin_s: float = 30.0) ->
     rall.RallError
         If a file of the real data is missing or at fault.
     """
-    from rol_data import rall
-    from rol_sim.session.settings import SessionSettings, SimulationSettings
-    from rol_sim.world.scene import Scene
-
     known = rall.load_scan_poses(rall.find_scan_poses(real_root))
     stamps, poses = np.array(list(known), dtype=np.int64), np.array(list(known.values()))
     turns = np.full(len(stamps), 250_000, dtype=np.int64)
@@ -307,17 +290,12 @@ def _flat(places: np.ndarray) -> np.ndarray:
 @lru_cache(maxsize=1)
 def _read_map(path: str, seed: int, unmapped_share: float) -> tuple[Cells, Cells]:
     """The map, and what stands there without being on it: the same for all sessions of a world."""
-    from rol_data import rall
-    from rol_sim.world.mapped import classify_cells, draw_unmapped
-
     cells = classify_cells(rall.load_map_points(path))
     return cells, draw_unmapped(cells, np.random.default_rng([seed, 0, 98]), share=unmapped_share)
 
 
 @lru_cache(maxsize=1)
 def _build_town(seed: int, loop_m: float, relief_m: float) -> Town:
-    from rol_sim.world.town import build_town
-
     return build_town(np.random.default_rng([seed, 0, 99]), loop_length=loop_m, relief=relief_m)
 
 
@@ -334,12 +312,8 @@ def make_scan(session: SimulatedSession, index: int) -> RadarScan:
     Returns
     -------
     scan : oxford.RadarScan
-        As `oxford.save_radar` takes it.
+        As `rol_sim.session.oxford_files.save_radar` takes it.
     """
-    from rol.oxford import RadarScan
-    from rol_sim.sensors.radar import simulate_scan
-    from rol_sim.session import logs
-
     stamp, turn, rng = (
         int(session.scans_us[index]),
         int(session.turns_us[index]),
@@ -384,9 +358,6 @@ def make_sweep(session: SimulatedSession, sensor: str, index: int) -> Sweep:
     sweep : Sweep
         The raw file's content, and the true materials.
     """
-    from rol.oxford import EXTRINSICS
-    from rol_sim.sensors.lidar import schedule_firings, simulate_sweep
-
     rng = session.generator(SWEEP + LIDARS.index(sensor), index)
     stamps, angles = schedule_firings(
         int(session.sweeps_us[sensor][index]), rng, first_angle=float(rng.uniform(0.0, 0.006))
@@ -423,10 +394,6 @@ def label_sweep(folder: Path | str, sensor: str, stamp_us: int) -> tuple[np.ndar
     ValueError
         If the sweep has no labels or they do not fit; the message names the file.
     """
-    import cv2
-
-    from rol.oxford import RANGE_UNIT, load_velodyne_raw, velodyne_raw_to_points
-
     path = Path(folder) / "labels" / sensor / f"{stamp_us}.png"
     labels = cv2.imread(str(path), cv2.IMREAD_UNCHANGED) if path.exists() else None
     if labels is None:
@@ -468,16 +435,11 @@ def sensor_settings(settings: SimulationSettings) -> tuple[LidarSettings, RadarS
     SettingsError
         If a sensor has no such setting, or its value is out of its range.
     """
-    from rol_sim.sensors.lidar import LidarSettings
-    from rol_sim.sensors.radar import RadarSettings
-
     radar = {"height": settings.radar_height_m, **settings.radar}
     return _fill(LidarSettings, settings.lidar, "lidar"), _fill(RadarSettings, radar, "radar")
 
 
 def _fill(kind: type, values: dict[str, Any], name: str) -> Any:
-    from rol_sim.session.settings import SettingsError
-
     known = [f.name for f in fields(kind)]
     unknown = sorted(set(values) - set(known))
     if unknown:

@@ -9,12 +9,14 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from rol.radar import MEASURED
+
 STYLES = (
     {"color": "#0072B2", "linestyle": "-"},
     {"color": "#E69F00", "linestyle": "-"},
     {"color": "#009E73", "linestyle": "--"},
 )
-BIN_M, OFFSET_M = 0.0438, -0.31  # as `radar` has them
+BIN_M, OFFSET_M = MEASURED.resolution_m, MEASURED.offset_m
 GREYS = plt.get_cmap("gray_r", 12)  # few levels: noise in fine ones makes large files and shows no more
 
 
@@ -66,7 +68,7 @@ def draw_doppler(ax: Axes, found: Mapping[str, dict]) -> Axes:
     return ax
 
 
-def draw_give_aways(axes: Sequence[Axes], found: Mapping[str, Mapping[str, float]]) -> Sequence[Axes]:
+def draw_auc_by_group(axes: Sequence[Axes], found: Mapping[str, Mapping[str, float]]) -> Sequence[Axes]:
     """Draw by which patches a classifier tells simulated from real scans.
 
     Parameters
@@ -74,7 +76,7 @@ def draw_give_aways(axes: Sequence[Axes], found: Mapping[str, Mapping[str, float
     axes : sequence of Axes
         One for each way to sort the patches.
     found : mapping
-        What `telling.give_aways` gives.
+        What `telling.auc_by_group` gives.
 
     Returns
     -------
@@ -124,7 +126,7 @@ def _draw_histogram(ax: Axes, statistics: dict, look: dict) -> None:
 
 
 def _draw_zeros(ax: Axes, statistics: dict, look: dict) -> None:
-    ranges, shares = zip(*statistics["zero_shares"].items(), strict=True)
+    ranges, shares = zip(*statistics["zero_fractions"].items(), strict=True)
     ax.plot(ranges, shares, marker="o", markersize=3.5, **look)
     ax.set(xlabel="range [m]", ylabel="share of code 0", title="quiet bins", ylim=(0.25, 0.6))
 
@@ -136,7 +138,7 @@ def _draw_range_correlation(ax: Axes, statistics: dict, look: dict) -> None:
 
 
 def _draw_rings(ax: Axes, statistics: dict, look: dict) -> None:
-    rings = statistics["shares_40_by_range"]
+    rings = statistics["fractions_40_by_range"]
     middles = [np.sqrt(np.prod([float(edge) for edge in ring.split("-")])) for ring in rings]
     ax.loglog(middles, list(rings.values()), marker="o", markersize=3.5, **look)
     ax.set(xlabel="range [m]", ylabel="share of codes ≥ 40", title="brightness")

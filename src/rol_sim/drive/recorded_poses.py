@@ -6,16 +6,21 @@ the poses (x, y, yaw) [m, m, rad].
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.spatial import cKDTree
 
-if TYPE_CHECKING:
-    from rol_sim.drive.planned import Drive
-    from rol_sim.drive.traffic import Traffic
-    from rol_sim.world.mesh import Mesh
+from rol_sim.drive.town_loop import POSE_STEP_US, Drive
+from rol_sim.drive.traffic import TRACK_STEP_US, Traffic
+from rol_sim.world.mesh import Mesh, merge_meshes, move_mesh
+from rol_sim.world.vehicles import (
+    MOVING_KINDS,
+    PARKED_KINDS,
+    build_cyclist,
+    build_pedestrian,
+    build_vehicle,
+    draw_kind,
+)
 
 MARGIN_US = 1_000_000  # the drive begins so long before the first scan and ends so long after the last
 LANE_M = 3.2  # from the middle of one lane to that of the other; oncoming traffic is on the right
@@ -24,7 +29,7 @@ SLOT_M = 6.3
 CATALOGUE = 24  # so many different vehicles drive about
 
 
-def interpolate_drive(stamps_us: np.ndarray, poses: np.ndarray) -> Drive:
+def interpolate_trajectory(stamps_us: np.ndarray, poses: np.ndarray) -> Drive:
     """Drive smoothly through given poses.
 
     Parameters
@@ -40,13 +45,11 @@ def interpolate_drive(stamps_us: np.ndarray, poses: np.ndarray) -> Drive:
         200 poses a second, from one second before the first pose to one second after the last; there the car
         goes on as it went.
     """
-    from rol_sim.drive.planned import STEP_US, Drive
-
     seconds, yaw = (stamps_us - stamps_us[0]) * 1e-6, np.unwrap(poses[:, 2])
     spline = CubicSpline(seconds, np.column_stack([poses[:, :2], yaw]))
     first = int(stamps_us[0]) - MARGIN_US
-    count = (int(stamps_us[-1]) + MARGIN_US - first) // STEP_US + 1
-    times = first + STEP_US * np.arange(count, dtype=np.int64)
+    count = (int(stamps_us[-1]) + MARGIN_US - first) // POSE_STEP_US + 1
+    times = first + POSE_STEP_US * np.arange(count, dtype=np.int64)
     at = (times - stamps_us[0]) * 1e-6
     inside = np.clip(at, 0.0, seconds[-1])
     velocity = spline(inside, 1)
@@ -117,9 +120,6 @@ def park_vehicles(
     mesh : Mesh
         The vehicles; empty if there is none.
     """
-    from rol_sim.world.mesh import merge_meshes, move_mesh
-    from rol_sim.world.vehicles import PARKED_KINDS, build_vehicle, draw_kind
-
     way, meshes = Way(drive), []
     s = np.arange(0.5 * SLOT_M, way.arc[-1], SLOT_M)
     things, lane = cKDTree(taken), cKDTree(way.poses[:, :2])
@@ -157,9 +157,6 @@ def plan_encounters(
     traffic : Traffic
         Each body is there while it is near.
     """
-    from rol_sim.drive.traffic import Traffic
-    from rol_sim.world.vehicles import build_pedestrian
-
     way, bodies = Way(drive), _draw_catalogue(rng)
     walkers = [build_pedestrian(rng) for _ in range(6)]
     movers: list[tuple[Mesh, int, np.ndarray]] = []
@@ -176,8 +173,6 @@ def plan_encounters(
 
 
 def _draw_catalogue(rng: np.random.Generator) -> list[Mesh]:
-    from rol_sim.world.vehicles import MOVING_KINDS, build_cyclist, build_vehicle, draw_kind
-
     return [
         build_cyclist(rng) if k % 8 == 7 else build_vehicle(draw_kind(MOVING_KINDS, rng), rng)
         for k in range(CATALOGUE)
@@ -196,11 +191,9 @@ def _draw_times(drive: Drive, per_min: float, least_s: float, rng: np.random.Gen
 
 def _grid(drive: Drive, begin: float, end: float) -> tuple[np.ndarray, np.ndarray]:
     """Times every 50 ms within the drive [us], and the car's arc length then [m]."""
-    from rol_sim.drive.traffic import STEP_US
-
     begin = max(int(begin), int(drive.stamps_us[0]))
-    end = max(min(int(end), int(drive.stamps_us[-1])), begin + 2 * STEP_US)
-    stamps = np.arange(begin, end, STEP_US, dtype=np.int64)
+    end = max(min(int(end), int(drive.stamps_us[-1])), begin + 2 * TRACK_STEP_US)
+    stamps = np.arange(begin, end, TRACK_STEP_US, dtype=np.int64)
     return stamps, np.interp(
         stamps - drive.stamps_us[0], drive.stamps_us - drive.stamps_us[0], drive.progress
     )
