@@ -31,7 +31,7 @@ from rol import mcl
 from rol.files import write_text
 from rol.oxford import load_radar, load_timestamps
 from rol.pix2pix import ResnetGenerator, TrainedNetwork, has_bf16, load_network
-from rol_beyond.front_ends import detect_points, translate_scan
+from rol_beyond.front_ends import detect_points, generate_points
 from rol_beyond.local_map_odometry import local_map_odometry
 from rol_beyond.motion import MotionModel
 from rol_beyond.robust import settings_for
@@ -77,7 +77,7 @@ def list_front_ends(full_width: int = 64) -> dict[str, FrontEnd]:
 
 def translate(network: TrainedNetwork, tta_rotations: int | None) -> FrontEnd:
     """A network as a front end."""
-    made = partial(translate_scan, network, bf16=has_bf16(), tta_rotations=tta_rotations)
+    made = partial(generate_points, network, bf16=has_bf16(), tta_rotations=tta_rotations)
     return lambda codes, azimuths: made(codes, azimuths)[0]
 
 
