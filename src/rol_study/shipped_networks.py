@@ -37,8 +37,8 @@ from rol.pix2pix import (
 )
 from rol.similarity import similarity_summary
 from rol.training import RunOptions, train
-from rol_beyond.front_ends import MIN_RANGE_M, judge_on_map, translate_scan
-from rol_beyond.scan_pairs import JoinedPairs, ScanPairs, gather_clouds
+from rol_beyond.augmentation import JoinedPairs, ScanPairs, gather_clouds
+from rol_beyond.front_ends import MIN_RANGE_M, evaluate_on_map, generate_points
 from rol_beyond.training_options import TrainingExtensions
 from rol_data import rall
 from rol_sim.session.settings import parse_settings
@@ -213,10 +213,10 @@ def evaluate_network(
     ]
     rows = []
     for scan in [] if real is None else real[0]:
-        _, _, generated = translate_scan(network, scan.power, scan.azimuths, scan.twist)
+        _, _, generated = generate_points(network, scan.power, scan.azimuths, scan.twist)
         for threshold in THRESHOLDS:
             points = image_to_points(generated, threshold=threshold, min_range=MIN_RANGE_M, thin=thin)
-            found = judge_on_map(points, scan.pose, real[1])
+            found = evaluate_on_map(points, scan.pose, real[1])
             near = {f"fake_to_real_within_{r}m": found[f"share_{r}m"] for r in (1, 2)}
             rows.append({"threshold": threshold, "n_fake": found["n"], **near})
     if rows:
