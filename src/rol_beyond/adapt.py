@@ -25,13 +25,13 @@ class RealPair:
 
     Attributes
     ----------
-    codes, azimuths : array, shape (a, b) and (a,)
-        Power codes, and counter-clockwise bearings of the rows [rad].
+    power, azimuths : array, shape (a, b) and (a,)
+        Power in half-dB steps, and counter-clockwise bearings of the rows [rad].
     points : array, shape (n, 2)
         Lidar points without the ground, in the radar frame [m].
     """
 
-    codes: np.ndarray
+    power: np.ndarray
     azimuths: np.ndarray
     points: np.ndarray
 
@@ -61,7 +61,7 @@ def draw_real_pair(
     threshold : int
         Grey value from which on the network's own drawing counts beyond.
     settings : dict
-        Of `rol_beyond.scan_pairs.turned_radar_image`.
+        Entries of `rol.pairs.PairSettings`.
     bf16 : bool
         Multiply in bfloat16, see `rol.pix2pix.has_bf16`.
 
@@ -71,14 +71,14 @@ def draw_real_pair(
         Within the reach the lidar's points, beyond it what the network drew.
     """
     from rol.bev import points_to_image
+    from rol.pairs import PairSettings
     from rol.pix2pix import generate
     from rol_beyond.scan_pairs import turned_radar_image
 
-    radar = turned_radar_image(
-        pair.power, pair.azimuths, turn, (0.0, 0.0, 0.0), {**settings, "motion": "none"}
-    )
+    how = PairSettings.from_dict({**settings, "motion": "none"})
+    radar = turned_radar_image(pair.power, pair.azimuths, turn, (0.0, 0.0, 0.0), how)
     c, s = np.cos(turn), np.sin(turn)
-    size, width = settings.get("pixel_size", 0.25), len(radar)
+    size, width = how.pixel_size, len(radar)
     seen = points_to_image(pair.points @ np.array([[c, s], [-s, c]]), width=width, pixel_size=size)
     axis = ((width - 1) / 2.0 - np.arange(width)) * size
     is_near = np.hypot(axis[:, None], axis[None, :]) < reach_m
@@ -119,7 +119,7 @@ def adapt(
     threshold : int
         See `draw_real_pair`.
     settings : dict, optional
-        Of `rol_beyond.scan_pairs.turned_radar_image`, such as ``range_resolution`` of the pairs' radar [m].
+        Entries of `rol.pairs.PairSettings`, such as ``range_resolution`` of the pairs' radar [m].
     bf16 : bool
         Multiply in bfloat16, see `rol.pix2pix.has_bf16`; halves the time there.
 
@@ -135,6 +135,7 @@ def adapt(
     """
     import torch
 
+    from rol.bev import normalize_image
     from rol.pix2pix import entropy_loss
 
     if len(pairs) == 0:
@@ -149,8 +150,7 @@ def adapt(
             draw_real_pair(before, pairs[i], turn, **how) for i, turn in zip(chosen, turns, strict=True)
         ]
         radar, lidar = (
-            torch.from_numpy(np.stack(side)[:, None].astype(np.float32) / np.float32(127.5) - np.float32(1.0))
-            for side in zip(*images, strict=True)
+            torch.from_numpy(normalize_image(np.stack(side)[:, None])) for side in zip(*images, strict=True)
         )
         with torch.autocast(device, torch.bfloat16, enabled=bf16):
             logits = adapted.logits(radar)

@@ -67,14 +67,16 @@ def translate_scan(
     Yin et al. 2020, Eq. 5.
     """
     from rol.bev import image_to_points
+    from rol.pairs import PairSettings
     from rol.pix2pix import generate
     from rol_beyond.scan_pairs import turned_radar_image
 
-    settings = {**network.settings, **changes, "motion": "none" if twist is None else "corrected"}
+    changes["motion"] = "none" if twist is None else "corrected"
+    settings = PairSettings.from_dict({**network.settings, **changes})
     radar = turned_radar_image(codes, azimuths, 0.0, twist or (0.0, 0.0, 0.0), settings)
     fake = generate(network.generator, radar, bf16=bf16, headings=headings)
     how = {**network.points, **(points or {}), "min_range": min_range_m}
-    size = {name: settings[name] for name in ("pixel_size", "max_range") if name in settings}
+    size = {"pixel_size": settings.pixel_size, "max_range": settings.max_range}
     return image_to_points(fake, **how, **size), radar, fake
 
 

@@ -17,6 +17,12 @@ from typing import Any
 
 import numpy as np
 
+from rol.bev import normalize_image, points_to_image
+from rol.files import write_bytes
+from rol.lidar import crop_range, remove_ground
+from rol.oxford import Session, load_radar
+from rol.pairs import AlignedScan, PairSettings, load_lidar_points, radar_to_image
+
 STEP_M = 0.05  # lidar points are kept once per cell of this edge
 
 
@@ -45,25 +51,25 @@ class ScanPairs:
 
     Parameters
     ----------
-    session : rol.oxford.Session
+    session : Session
         The session.
-    jobs : sequence of dict
-        The scans, from `rol.pairs.job_of_row`.
+    aligned : sequence of AlignedScan
+        The scans.
     clouds : LidarClouds
         Their lidar points, from `gather_clouds`.
-    settings : dict
-        Those of `rol.pairs.build_pair` that concern the radar image and its size.
+    settings : PairSettings
+        Settings of the images.
     """
 
     def __init__(
-        self, session: Any, jobs: Sequence[dict[str, Any]], clouds: LidarClouds, settings: dict[str, Any]
+        self, session: Session, aligned: Sequence[AlignedScan], clouds: LidarClouds, settings: PairSettings
     ) -> None:
-        if len(jobs) != len(clouds.starts) - 1:
-            raise ValueError(f"{session.name}: {len(jobs)} scans, but clouds of {len(clouds.starts) - 1}")
-        self.session, self.jobs, self.clouds, self.settings = session, list(jobs), clouds, settings
+        if len(aligned) != len(clouds.starts) - 1:
+            raise ValueError(f"{session.name}: {len(aligned)} scans, but clouds of {len(clouds.starts) - 1}")
+        self.session, self.aligned, self.clouds, self.settings = session, list(aligned), clouds, settings
 
     def __len__(self) -> int:
-        return len(self.jobs)
+        return len(self.aligned)
 
     def __getitem__(self, index: int) -> tuple[np.ndarray, np.ndarray]:
         """Give a pair as it was recorded, see `draw`."""
@@ -71,7 +77,7 @@ class ScanPairs:
 
     def name(self, index: int) -> str:
         """Name the file of the scan."""
-        return str(self.session.radar_path(self.jobs[index]["radar_stamp"]))
+        return str(self.session.radar_path(self.aligned[index].radar_stamp_us))
 
     def draw(
         self,
@@ -102,28 +108,18 @@ class ScanPairs:
         radar, lidar : array, shape (1, h, w), float32
             -1 for code 0 and for empty, +1 for code 255 and for occupied.
         """
-        from rol.bev import points_to_image
-        from rol.oxford import load_radar
-
-        scan = load_radar(self.session.radar_path(self.jobs[index]["radar_stamp"]))
+        scan = load_radar(self.session.radar_path(self.aligned[index].radar_stamp_us))
         codes = shift_codes(scan.power, gain_db)
         if n_streaks + n_ghosts > 0:
             if rng is None:
                 raise ValueError("streaks and ghosts need a generator of random numbers")
             codes = add_ghosts(add_streaks(codes, n_streaks, rng), n_ghosts, rng)
-        radar = turned_radar_image(codes, scan.azimuths, turn, self.jobs[index]["twist"], self.settings)
+        radar = turned_radar_image(codes, scan.azimuths, turn, self.aligned[index].twist, self.settings)
         c, s = np.cos(turn), np.sin(turn)
         points = self.clouds.cloud(index) @ np.array([[c, s], [-s, c]])
-        size = {
-            name: self.settings[name]
-            for name in ("width", "pixel_size", "max_range")
-            if name in self.settings
-        }
+        size = {name: getattr(self.settings, name) for name in ("width", "pixel_size", "max_range")}
         lidar = points_to_image(points, **size)
-        images = (
-            image[None].astype(np.float32) / np.float32(127.5) - np.float32(1.0) for image in (radar, lidar)
-        )
-        return tuple(images)  # type: ignore[return-value]
+        return normalize_image(radar[None]), normalize_image(lidar[None])
 
 
 def shift_codes(codes: np.ndarray, gain_db: float) -> np.ndarray:
@@ -213,7 +209,7 @@ def add_ghosts(codes: np.ndarray, n: int, rng: np.random.Generator) -> np.ndarra
 
 
 def turned_radar_image(
-    codes: np.ndarray, azimuths: np.ndarray, turn: float, twist: Sequence[float], settings: dict[str, Any]
+    codes: np.ndarray, azimuths: np.ndarray, turn: float, twist: Sequence[float], settings: PairSettings
 ) -> np.ndarray:
     """Make the radar image of `rol.pairs.build_pair` from a scan whose surroundings are turned.
 
@@ -225,41 +221,25 @@ def turned_radar_image(
         Counter-clockwise turn [rad].
     twist : sequence of float
         Body velocity (vx, vy, yaw rate) before the turn [m/s, m/s, rad/s].
-    settings : dict
-        ``motion`` ("none" or "corrected"), ``range_resolution``, ``range_offset``, ``doppler_seconds``,
-        ``width``, ``pixel_size``, each with the default of `build_pair`.
+    settings : PairSettings
+        Settings of the image.
 
     Returns
     -------
     image : array, shape (width, width), uint8
         Power 0..255.
     """
-    from rol.radar import DOPPLER_SECONDS, MEASURED, RangeCalibration, ScanMotion, polar_to_cartesian
-
     c, s = np.cos(turn), np.sin(turn)
     vx, vy, rate = twist
     turned = (c * vx - s * vy, s * vx + c * vy, rate)
-    power = polar_to_cartesian(
-        codes,
-        azimuths + turn,
-        calibration=RangeCalibration(
-            settings.get("range_resolution", MEASURED.resolution_m),
-            settings.get("range_offset", MEASURED.offset_m),
-        ),
-        pixel_size=settings.get("pixel_size", 0.25),
-        width=settings.get("width", 512),
-        motion=ScanMotion(turned, doppler_seconds=settings.get("doppler_seconds", DOPPLER_SECONDS))
-        if settings.get("motion", "none") == "corrected"
-        else None,
-    )
-    return np.rint(power * 255.0).astype(np.uint8)
+    return radar_to_image(codes, azimuths + turn, turned, settings)
 
 
 def gather_clouds(
-    session: Any,
-    jobs: Sequence[dict[str, Any]],
+    session: Session,
+    aligned: Sequence[AlignedScan],
     path: str | Path,
-    settings: dict[str, Any],
+    settings: PairSettings,
     *,
     workers: int = 1,
     report: Callable[[str], None] = lambda line: None,
@@ -268,14 +248,14 @@ def gather_clouds(
 
     Parameters
     ----------
-    session : rol.oxford.Session
+    session : Session
         The session.
-    jobs : sequence of dict
-        The scans, from `rol.pairs.job_of_row`.
+    aligned : sequence of AlignedScan
+        The scans.
     path : path
-        File for the points, ``*.npz``; read instead if it is there and of these jobs and settings.
-    settings : dict
-        ``motion``, ``min_height`` and ``max_range`` of `rol.pairs.build_pair`.
+        File for the points, ``*.npz``; read instead if it is there and of these scans and settings.
+    settings : PairSettings
+        ``motion``, ``min_height`` and ``max_range`` are used.
     workers : int
         Processes.
     report : callable
@@ -284,21 +264,19 @@ def gather_clouds(
     Returns
     -------
     clouds : LidarClouds
-        In the order of the jobs.
+        In the order of the scans.
     """
-    from rol.files import write_bytes
-
-    path, about = Path(path), repr((sorted(settings.items()), [sorted(job.items()) for job in jobs]))
+    path, about = Path(path), repr((settings, list(aligned)))
     if path.is_file():
         with np.load(path) as file:
             if str(file["about"]) == about:
                 return LidarClouds(file["points"], file["starts"])
-    tasks, parts = [(session, job, settings) for job in jobs], []
+    tasks, parts = [(session, one, settings) for one in aligned], []
     with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
         for part in pool.map(_gather_one, tasks, chunksize=8):
             parts.append(part)
             if len(parts) % 500 == 0:
-                report(f"{session.name}: lidar points of {len(parts)} of {len(jobs)} scans")
+                report(f"{session.name}: lidar points of {len(parts)} of {len(aligned)} scans")
     clouds = LidarClouds(np.concatenate(parts), np.cumsum([0, *map(len, parts)]))
     content = BytesIO()
     np.savez_compressed(content, points=clouds.points, starts=clouds.starts, about=about)
@@ -306,18 +284,14 @@ def gather_clouds(
     return clouds
 
 
-def _gather_one(task: tuple[Any, dict[str, Any], dict[str, Any]]) -> np.ndarray:
-    from rol.lidar import crop_range, remove_ground
-    from rol.pairs import load_lidar_points
-
-    session, job, settings = task
-    twist = job["twist"] if settings.get("motion", "none") == "corrected" else None
-    points = load_lidar_points(
-        session, job["left_stamp"], job["right_stamp"], mid_stamp_us=job["mid_stamp_us"], twist=twist
+def _gather_one(task: tuple[Session, AlignedScan, PairSettings]) -> np.ndarray:
+    session, one, settings = task
+    twist, sweeps = (
+        one.twist if settings.motion == "corrected" else None,
+        (one.left_stamp_us, one.right_stamp_us),
     )
-    points = crop_range(
-        remove_ground(points, settings.get("min_height", -1.5)), settings.get("max_range", 64.0) + 0.25
-    )
+    points = load_lidar_points(session, *sweeps, mid_stamp_us=one.mid_stamp_us, twist=twist)
+    points = crop_range(remove_ground(points, settings.min_height), settings.max_range + 0.25)
     return np.unique(np.rint(points[:, :2] / STEP_M).astype(np.int16), axis=0)
 
 
