@@ -118,12 +118,12 @@ def test_places_choose_scans_and_waiting_ones_are_left_out(recipe: Path) -> None
     given = train_weights.load_recipe(recipe)
     train_weights.make_sessions(given, {"sim-x"}, 1)
     root, part = Path(given["sessions_root"]), {"session": "sim-x"}
-    _, every = train_weights.choose_jobs(root, part, "corrected")
+    _, every = train_weights.choose_scans(root, part, "corrected")
     truth = np.loadtxt(root / "sim-x" / "truth.tum")
     place = truth[1, 1:3].tolist()
-    _, near = train_weights.choose_jobs(root, {**part, "within": [[*place, 1.0]]}, "corrected")
-    _, far = train_weights.choose_jobs(root, {**part, "without": [[*place, 1.0]]}, "corrected")
-    stamps = [[job["radar_stamp"] for job in jobs] for jobs in (every, near, far)]
+    _, near = train_weights.choose_scans(root, {**part, "within": [[*place, 1.0]]}, "corrected")
+    _, far = train_weights.choose_scans(root, {**part, "without": [[*place, 1.0]]}, "corrected")
+    stamps = [[one.radar_stamp_us for one in aligned] for aligned in (every, near, far)]
     assert sorted(stamps[1] + stamps[2]) == stamps[0] and 0 < len(near) < len(every)
 
 
