@@ -9,14 +9,14 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 
 from rol.bev import points_to_image
 from rol.geometry import check_fields
+from rol.pairs import PairSettings
 from rol.pix2pix import Generator, generate, to_tensor
 from rol_beyond.augmentation import rotate_points, rotated_radar_image
 from rol_beyond.training_options import bce_loss
@@ -57,7 +57,7 @@ class AdaptationConfig:
 
 
 def draw_real_pair(
-    generator: Generator, pair: RealPair, turn: float, config: AdaptationConfig, settings: dict[str, Any]
+    generator: Generator, pair: RealPair, turn: float, config: AdaptationConfig, settings: PairSettings
 ) -> tuple[np.ndarray, np.ndarray]:
     """Make the radar image and the target image of a pair.
 
@@ -71,18 +71,17 @@ def draw_real_pair(
         Counter-clockwise rotation of the surroundings [rad].
     config : AdaptationConfig
         Reach of the lidar, threshold, precision.
-    settings : dict
-        Of `rol_beyond.augmentation.rotated_radar_image`.
+    settings : PairSettings
+        Settings of the images; motion is not compensated.
 
     Returns
     -------
     radar, target : array, shape (w, w), uint8
         The target is the lidar's image within the reach, and the network's output beyond it.
     """
-    radar = rotated_radar_image(
-        pair.power, pair.azimuths, turn, (0.0, 0.0, 0.0), {**settings, "motion": "none"}
-    )
-    size, width = settings.get("pixel_size", 0.25), len(radar)
+    still = replace(settings, motion="none")
+    radar = rotated_radar_image(pair.power, pair.azimuths, turn, (0.0, 0.0, 0.0), still)
+    size, width = settings.pixel_size, len(radar)
     seen = points_to_image(rotate_points(pair.points, turn), width=width, pixel_size=size)
     axis = ((width - 1) / 2.0 - np.arange(width)) * size
     is_near = np.hypot(axis[:, None], axis[None, :]) < config.reach_m
@@ -95,7 +94,7 @@ def adapt(
     pairs: Sequence[RealPair],
     rng: np.random.Generator,
     config: AdaptationConfig,
-    settings: dict[str, Any] | None = None,
+    settings: PairSettings | None = None,
 ) -> Generator:
     """Fine-tune a copy of a network on a few real pairs with random rotations.
 
@@ -109,8 +108,8 @@ def adapt(
         Draws pairs and rotations.
     config : AdaptationConfig
         The settings.
-    settings : dict, optional
-        Of `rol_beyond.augmentation.rotated_radar_image`, such as ``range_resolution`` of the pairs' radar [m].
+    settings : PairSettings, optional
+        Settings of the images, such as ``range_resolution`` of the pairs' radar [m]; the defaults if not given.
 
     Returns
     -------
@@ -131,7 +130,7 @@ def adapt(
         chosen = rng.integers(len(pairs), size=config.batch_size)
         turns = rng.uniform(-np.pi, np.pi, config.batch_size)
         images = [
-            draw_real_pair(before, pairs[i], turn, config, settings or {})
+            draw_real_pair(before, pairs[i], turn, config, settings or PairSettings())
             for i, turn in zip(chosen, turns, strict=True)
         ]
         radar, lidar = (torch.cat([to_tensor(image) for image in side]) for side in zip(*images, strict=True))

@@ -16,12 +16,11 @@ from typing import Any
 
 import numpy as np
 
-from rol.bev import points_to_image
+from rol.bev import normalize_image, points_to_image
 from rol.files import write_bytes
 from rol.lidar import crop_range, remove_ground
-from rol.oxford import load_radar
-from rol.pairs import load_lidar_points
-from rol.radar import DOPPLER_SECONDS, MEASURED, RangeCalibration, ScanMotion, polar_to_cartesian
+from rol.oxford import Session, load_radar
+from rol.pairs import AlignedScan, PairSettings, load_lidar_points, radar_to_image
 
 STEP_M = 0.05  # lidar points are kept once per cell of this edge
 
@@ -51,25 +50,25 @@ class ScanPairs:
 
     Parameters
     ----------
-    session : rol.oxford.Session
+    session : Session
         The session.
-    jobs : sequence of dict
-        The scans, from `rol.pairs.job_of_row`.
+    aligned : sequence of AlignedScan
+        The scans.
     clouds : LidarClouds
         Their lidar points, from `gather_clouds`.
-    settings : dict
-        Those of `rol.pairs.build_pair` that concern the radar image and its size.
+    settings : PairSettings
+        Settings of the images.
     """
 
     def __init__(
-        self, session: Any, jobs: Sequence[dict[str, Any]], clouds: LidarClouds, settings: dict[str, Any]
+        self, session: Session, aligned: Sequence[AlignedScan], clouds: LidarClouds, settings: PairSettings
     ) -> None:
-        if len(jobs) != len(clouds.starts) - 1:
-            raise ValueError(f"{session.name}: {len(jobs)} scans, but clouds of {len(clouds.starts) - 1}")
-        self.session, self.jobs, self.clouds, self.settings = session, list(jobs), clouds, settings
+        if len(aligned) != len(clouds.starts) - 1:
+            raise ValueError(f"{session.name}: {len(aligned)} scans, but clouds of {len(clouds.starts) - 1}")
+        self.session, self.aligned, self.clouds, self.settings = session, list(aligned), clouds, settings
 
     def __len__(self) -> int:
-        return len(self.jobs)
+        return len(self.aligned)
 
     def __getitem__(self, index: int) -> tuple[np.ndarray, np.ndarray]:
         """Return a pair as it was recorded, see `draw`."""
@@ -77,7 +76,7 @@ class ScanPairs:
 
     def name(self, index: int) -> str:
         """Return the path of the scan."""
-        return str(self.session.radar_path(self.jobs[index]["radar_stamp"]))
+        return str(self.session.radar_path(self.aligned[index].radar_stamp_us))
 
     def draw(
         self,
@@ -108,23 +107,16 @@ class ScanPairs:
         radar, lidar : array, shape (1, h, w), float32
             -1 for grey value 0 and for empty, +1 for 255 and for occupied.
         """
-        scan = load_radar(self.session.radar_path(self.jobs[index]["radar_stamp"]))
+        scan = load_radar(self.session.radar_path(self.aligned[index].radar_stamp_us))
         power = apply_gain(scan.power, gain_db)
         if n_streaks + n_ghosts > 0:
             if rng is None:
                 raise ValueError("streaks and ghosts need a random generator")
             power = add_ghosts(add_streaks(power, n_streaks, rng), n_ghosts, rng)
-        radar = rotated_radar_image(power, scan.azimuths, turn, self.jobs[index]["twist"], self.settings)
-        size = {
-            name: self.settings[name]
-            for name in ("width", "pixel_size", "max_range")
-            if name in self.settings
-        }
+        radar = rotated_radar_image(power, scan.azimuths, turn, self.aligned[index].twist, self.settings)
+        size = {name: getattr(self.settings, name) for name in ("width", "pixel_size", "max_range")}
         lidar = points_to_image(rotate_points(self.clouds.cloud(index), turn), **size)
-        images = (
-            image[None].astype(np.float32) / np.float32(127.5) - np.float32(1.0) for image in (radar, lidar)
-        )
-        return tuple(images)  # type: ignore[return-value]
+        return normalize_image(radar[None]), normalize_image(lidar[None])
 
 
 def rotate_points(points: np.ndarray, turn: float) -> np.ndarray:
@@ -219,7 +211,7 @@ def add_ghosts(power: np.ndarray, n: int, rng: np.random.Generator) -> np.ndarra
 
 
 def rotated_radar_image(
-    power: np.ndarray, azimuths: np.ndarray, turn: float, twist: Sequence[float], settings: dict[str, Any]
+    power: np.ndarray, azimuths: np.ndarray, turn: float, twist: Sequence[float], settings: PairSettings
 ) -> np.ndarray:
     """Make the radar image of `rol.pairs.build_pair` from a scan with rotated surroundings.
 
@@ -231,9 +223,8 @@ def rotated_radar_image(
         Counter-clockwise rotation [rad].
     twist : sequence of float
         Body velocity (vx, vy, yaw rate) before the rotation [m/s, m/s, rad/s].
-    settings : dict
-        ``motion`` ("none" or "corrected"), ``range_resolution``, ``range_offset``, ``doppler_seconds``, ``width``,
-        ``pixel_size``, each with the default of `build_pair`.
+    settings : PairSettings
+        Settings of the image.
 
     Returns
     -------
@@ -242,27 +233,15 @@ def rotated_radar_image(
     """
     c, s = np.cos(turn), np.sin(turn)
     vx, vy, rate = twist
-    motion = None
-    if settings.get("motion", "none") == "corrected":
-        rotated = (c * vx - s * vy, s * vx + c * vy, rate)
-        motion = ScanMotion(rotated, doppler_seconds=settings.get("doppler_seconds", DOPPLER_SECONDS))
-    resolution = settings.get("range_resolution", MEASURED.resolution_m)
-    image = polar_to_cartesian(
-        power,
-        azimuths + turn,
-        calibration=RangeCalibration(resolution, settings.get("range_offset", MEASURED.offset_m)),
-        pixel_size=settings.get("pixel_size", 0.25),
-        width=settings.get("width", 512),
-        motion=motion,
-    )
-    return np.rint(image * 255.0).astype(np.uint8)
+    rotated = (c * vx - s * vy, s * vx + c * vy, rate)
+    return radar_to_image(power, azimuths + turn, rotated, settings)
 
 
 def gather_clouds(
-    session: Any,
-    jobs: Sequence[dict[str, Any]],
+    session: Session,
+    aligned: Sequence[AlignedScan],
     path: str | Path,
-    settings: dict[str, Any],
+    settings: PairSettings,
     *,
     workers: int = 1,
     report: Callable[[str], None] = lambda line: None,
@@ -271,14 +250,14 @@ def gather_clouds(
 
     Parameters
     ----------
-    session : rol.oxford.Session
+    session : Session
         The session.
-    jobs : sequence of dict
-        The scans, from `rol.pairs.job_of_row`.
+    aligned : sequence of AlignedScan
+        The scans.
     path : path
-        File for the points, ``*.npz``; read instead if it exists with these jobs and settings.
-    settings : dict
-        ``motion``, ``min_height`` and ``max_range`` of `rol.pairs.build_pair`.
+        File for the points, ``*.npz``; read instead if it exists with these scans and settings.
+    settings : PairSettings
+        ``motion``, ``min_height`` and ``max_range`` are used.
     workers : int
         Processes.
     report : callable
@@ -287,19 +266,19 @@ def gather_clouds(
     Returns
     -------
     clouds : LidarClouds
-        In the order of the jobs.
+        In the order of the scans.
     """
-    path, about = Path(path), repr((sorted(settings.items()), [sorted(job.items()) for job in jobs]))
+    path, about = Path(path), repr((settings, list(aligned)))
     if path.is_file():
         with np.load(path) as file:
             if str(file["about"]) == about:
                 return LidarClouds(file["points"], file["starts"])
-    tasks, parts = [(session, job, settings) for job in jobs], []
+    tasks, parts = [(session, one, settings) for one in aligned], []
     with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
         for part in pool.map(_gather_one, tasks, chunksize=8):
             parts.append(part)
             if len(parts) % 500 == 0:
-                report(f"{session.name}: lidar points of {len(parts)} of {len(jobs)} scans")
+                report(f"{session.name}: lidar points of {len(parts)} of {len(aligned)} scans")
     clouds = LidarClouds(np.concatenate(parts), np.cumsum([0, *map(len, parts)]))
     content = BytesIO()
     np.savez_compressed(content, points=clouds.points, starts=clouds.starts, about=about)
@@ -307,15 +286,12 @@ def gather_clouds(
     return clouds
 
 
-def _gather_one(task: tuple[Any, dict[str, Any], dict[str, Any]]) -> np.ndarray:
-    session, job, settings = task
-    twist = job["twist"] if settings.get("motion", "none") == "corrected" else None
-    points = load_lidar_points(
-        session, job["left_stamp"], job["right_stamp"], mid_stamp_us=job["mid_stamp_us"], twist=twist
-    )
-    points = crop_range(
-        remove_ground(points, settings.get("min_height", -1.5)), settings.get("max_range", 64.0) + 0.25
-    )
+def _gather_one(task: tuple[Session, AlignedScan, PairSettings]) -> np.ndarray:
+    session, one, settings = task
+    twist = one.twist if settings.motion == "corrected" else None
+    sweeps = one.left_stamp_us, one.right_stamp_us
+    points = load_lidar_points(session, *sweeps, mid_stamp_us=one.mid_stamp_us, twist=twist)
+    points = crop_range(remove_ground(points, settings.min_height), settings.max_range + 0.25)
     return np.unique(np.rint(points[:, :2] / STEP_M).astype(np.int16), axis=0)
 
 

@@ -14,6 +14,7 @@ from scipy.spatial import cKDTree
 
 from rol.bev import image_to_points
 from rol.geometry import transform_points
+from rol.pairs import PairSettings
 from rol.radar import MEASURED, RangeCalibration, ScanMotion, check_scan, find_peaks, peaks_to_points
 from rol.similarity import fraction_within
 from rol_beyond.augmentation import rotated_radar_image
@@ -72,10 +73,11 @@ def generate_points(
     """
     from rol.pix2pix import generate
 
-    settings = {**network.settings, "motion": "none" if twist is None else "corrected"}
+    motion = "none" if twist is None else "corrected"
+    settings = PairSettings.from_dict({**network.settings, "motion": motion})
     radar = rotated_radar_image(power, azimuths, 0.0, twist or (0.0, 0.0, 0.0), settings)
     generated = generate(network.generator, radar, bf16=bf16, tta_rotations=tta_rotations)
-    size = {name: settings[name] for name in ("pixel_size", "max_range") if name in settings}
+    size = {"pixel_size": settings.pixel_size, "max_range": settings.max_range}
     return image_to_points(generated, **network.points, min_range=min_range_m, **size), radar, generated
 
 

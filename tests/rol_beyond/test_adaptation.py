@@ -8,6 +8,7 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
+from rol.pairs import PairSettings
 from rol.pix2pix import build_generator, generate
 from rol_beyond import unet  # noqa: F401 (registers its architecture)
 from rol_beyond.adaptation import AdaptationConfig, RealPair, adapt, draw_real_pair
@@ -15,7 +16,7 @@ from rol_beyond.adaptation import AdaptationConfig, RealPair, adapt, draw_real_p
 pytestmark = pytest.mark.torch
 AZIMUTHS = -2.0 * np.pi * np.arange(400) / 400
 NEAR = AdaptationConfig(reach_m=15.0, threshold=100)
-SETTINGS = {"width": 64, "pixel_size": 1.0, "range_resolution": 0.1, "range_offset": 0.0}
+SETTINGS = PairSettings(width=64, pixel_size=1.0, range_resolution=0.1, range_offset=0.0)
 
 
 def make_pair(seed: int) -> RealPair:

@@ -1,5 +1,6 @@
 """Augmentation: a rotated pair shows the rotated surroundings, gain, streaks and ghosts, joined sets."""
 
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -8,12 +9,13 @@ import pytest
 
 from rol.bev import image_to_points
 from rol.oxford import RadarScan
+from rol.pairs import AlignedScan, PairSettings
 from rol_beyond import augmentation
 from rol_beyond.augmentation import JoinedPairs, LidarClouds, ScanPairs, rotated_radar_image
 from rol_sim.session.oxford_files import save_radar
 
 AZIMUTHS = -2.0 * np.pi * (13 + 14 * np.arange(400)) / 5600
-SETTINGS = {"width": 256, "pixel_size": 0.5, "max_range": 60.0, "motion": "corrected"}
+SETTINGS = PairSettings("corrected", max_range=60.0, width=256, pixel_size=0.5)
 
 
 def bright_spot(bearing: float, range_m: float) -> np.ndarray:
@@ -46,7 +48,7 @@ def test_a_turned_scan_is_the_scan_of_a_turned_world(turn: float, twist: tuple) 
 
 def test_without_motion_turning_by_rows_moves_rows() -> None:
     codes = np.random.default_rng(0).integers(0, 120, (400, 3768)).astype(np.uint8)
-    plain = {**SETTINGS, "motion": "none"}
+    plain = replace(SETTINGS, motion="none")
     turned = rotated_radar_image(codes, AZIMUTHS, -2.0 * np.pi * 100 / 400, (0, 0, 0), plain)
     rolled = rotated_radar_image(np.roll(codes, 100, axis=0), AZIMUTHS, 0.0, (0, 0, 0), plain)
     assert np.abs(turned.astype(int) - rolled).max() <= 1
@@ -92,13 +94,10 @@ def make_pairs(tmp_path: Path) -> ScanPairs:
         ),
     )  # fmt: skip
     session = SimpleNamespace(name="sim-x", radar_path=lambda us: tmp_path / f"{us}.png")
-    jobs = [
-        {"radar_stamp": 1000, "left_stamp": 1, "right_stamp": 2, "mid_stamp_us": 3, "twist": (5.0, 0.0, 0.1)}
-    ]
-    points = np.rint(np.array([[10.0, 2.0], [-20.0, 31.0], [3.0, -8.0]]) / augmentation.STEP_M).astype(
-        np.int16
-    )
-    return ScanPairs(session, jobs, LidarClouds(points, np.array([0, 3])), SETTINGS)
+    aligned = [AlignedScan(1000, 1, 2, 3, (5.0, 0.0, 0.1))]
+    points = np.array([[10.0, 2.0], [-20.0, 31.0], [3.0, -8.0]])
+    points = np.rint(points / augmentation.STEP_M).astype(np.int16)
+    return ScanPairs(session, aligned, LidarClouds(points, np.array([0, 3])), SETTINGS)
 
 
 def test_both_sides_of_a_pair_turn_together(tmp_path: Path) -> None:
@@ -127,4 +126,6 @@ def test_joined_sets_count_on(tmp_path: Path) -> None:
     with pytest.raises(IndexError, match="pair 3 of 3"):
         joined[3]
     with pytest.raises(ValueError, match="1 scans, but clouds of 2"):
-        ScanPairs(pairs.session, pairs.jobs, LidarClouds(pairs.clouds.points, np.array([0, 1, 3])), SETTINGS)
+        ScanPairs(
+            pairs.session, pairs.aligned, LidarClouds(pairs.clouds.points, np.array([0, 1, 3])), SETTINGS
+        )
