@@ -45,7 +45,7 @@ class LocalizedScan:
     update: Any
 
 
-def generate_points(network: TrainedNetwork, scan: Any) -> np.ndarray:
+def scan_to_points(network: TrainedNetwork, scan: Any) -> np.ndarray:
     """Generate lidar points from a radar scan.
 
     Parameters
@@ -108,14 +108,14 @@ class RadarLocalizer:
         Parameters
         ----------
         scan : RadarScan
-            As for `generate_points`.
+            As for `scan_to_points`.
 
         Returns
         -------
         result : LocalizedScan
             Yin et al. 2020, Sec. III.
         """
-        points, increment = generate_points(self.network, scan), None
+        points, increment = scan_to_points(self.network, scan), None
         if self.last_points is not None:
             # The initial guess of ICP is the last increment: constant velocity.
             increment = icp_2d(points, self.last_points, self.increment).T_target_source

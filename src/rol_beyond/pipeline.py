@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from rol.pipeline import LocalizedScan
-from rol_beyond.front_ends import even_out
+from rol_beyond.front_ends import resample_by_density
 from rol_beyond.local_map_odometry import LocalMapOdometry
 from rol_beyond.recovery import RecoveringFilter
 
@@ -24,9 +24,9 @@ class RobustLocalizer:
         Map, start and settings.
     front_end : callable
         Takes a scan and a twist (vx, vy, yaw rate) or None and returns points in the radar frame, shape (n, 2) [m],
-        compensated for the twist; for instance a `rol_beyond.front_ends.translate_scan` with its network.
-    even_m : float
-        Radius of `rol_beyond.front_ends.even_out` for the points given to the filter [m]; 0 leaves them as they are.
+        compensated for the twist; for instance a `rol_beyond.front_ends.generate_points` with its network.
+    density_radius_m : float
+        Radius of `rol_beyond.front_ends.resample_by_density` for the points given to the filter [m]; 0 leaves them as they are.
     odometry : LocalMapOdometry, optional
         With other settings than the default.
     """
@@ -36,10 +36,10 @@ class RobustLocalizer:
         robust_filter: RecoveringFilter,
         front_end: FrontEnd,
         *,
-        even_m: float = 0.0,
+        density_radius_m: float = 0.0,
         odometry: LocalMapOdometry | None = None,
     ) -> None:
-        self.robust_filter, self.front_end, self.even_m = robust_filter, front_end, even_m
+        self.robust_filter, self.front_end, self.density_radius_m = robust_filter, front_end, density_radius_m
         self.odometry = odometry or LocalMapOdometry()
 
     def step(self, scan: Any) -> LocalizedScan:
@@ -62,6 +62,8 @@ class RobustLocalizer:
         found = self.odometry.step(points, scan.stamp_us)
         if found is not None:
             points, increment = self.front_end(scan, tuple(found.twist)), found.T_target_source
-        used = even_out(points, self.even_m, self.robust_filter.rng) if self.even_m else points
+        used = points
+        if self.density_radius_m:
+            used = resample_by_density(points, self.density_radius_m, self.robust_filter.rng)
         update = self.robust_filter.step(used, increment)
         return LocalizedScan(update.pose, update.covariance, points, update)

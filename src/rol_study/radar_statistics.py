@@ -304,11 +304,15 @@ def _mean_correlation(
     middle = (width - 1) / 2.0
     images = [
         polar_to_cartesian(
-            scan, azimuths, calibration=MEASURED, pixel_size=pixel, width=width,
+            scan,
+            azimuths,
+            calibration=MEASURED,
+            pixel_size=pixel,
+            width=width,
             motion=None if twists is None else ScanMotion(twists[i], doppler_seconds=doppler_seconds),
         )
         for i, scan in enumerate(codes)
-    ]  # fmt: skip
+    ]
     away = np.hypot(*(np.mgrid[:width, :width] - middle)) * pixel
     own = np.where((away > 4.0) & (away < 50.0), np.float32(0.0), np.float32(np.nan))  # no leakage
     for before, after, (x, y, yaw) in zip(images[:-lag], images[lag:], ways, strict=True):
@@ -423,8 +427,13 @@ def map_fractions(
     tree, shares = cKDTree(map_points), []
     for scan, pose in zip(codes, poses, strict=True):
         peaks = k_strongest_peaks(
-            scan, beam_azimuths(), k, min_code, range_limits_m=(2.5, max_range_m), calibration=MEASURED,
-        )  # fmt: skip
+            scan,
+            beam_azimuths(),
+            k,
+            min_code,
+            range_limits_m=(2.5, max_range_m),
+            calibration=MEASURED,
+        )
         gaps = tree.query(transform_points(pose, peaks))[0]
         shares.append([float(np.mean(gaps < limit)) if len(gaps) else float("nan") for limit in within_m])
     return np.array(shares)

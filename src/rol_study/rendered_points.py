@@ -90,7 +90,7 @@ def render_points(
 def build_segment(
     real_root: Path | str, number: str, first_scan: int, n_scans: int, seed: int, **changes: Any
 ) -> SimulatedSession:
-    """Prepare the drive along a stretch of a real session, see `render_points`.
+    """Prepare the trajectory along a stretch of a real session, see `render_points`.
 
     Returns
     -------
@@ -99,9 +99,15 @@ def build_segment(
     """
     name, path = f"sim-rendered-{number}", Path(real_root) / rall.POSES_PATH / f"pose_xy_{number}.txt"
     own = {
-        "start": "2019-01-10T12:00:00", "seed": zlib.crc32(str(number).encode()), "sweeps": "none", **STREET, **changes,
-        "poses": number, "first_scan": int(first_scan), "scans": int(n_scans),
-    }  # fmt: skip
+        "start": "2019-01-10T12:00:00",
+        "seed": zlib.crc32(str(number).encode()),
+        "sweeps": "none",
+        **STREET,
+        **changes,
+        "poses": number,
+        "first_scan": int(first_scan),
+        "scans": int(n_scans),
+    }
     section = {"world": "route", "seed": int(seed), "real_root": str(real_root), "sessions": {name: own}}
     return build_session(parse_settings(section, str(path)), name)
 
@@ -126,7 +132,7 @@ def true_twists(session: SimulatedSession) -> np.ndarray:
         vx, vy, yaw rate [m/s, m/s, rad/s].
     """
     first, middles = session.scans_us, session.scans_us + session.turns_us // 2
-    poses = session.drive.pose(middles)
+    poses = session.trajectory.pose(middles)
     steps = np.zeros((len(poses) - 1, 6))
     steps[:, [0, 1, 5]] = relative_pose(poses[:-1], poses[1:])
     return estimate_twists(RadarOdometry(middles[1:], middles[:-1], first[1:], first[:-1], steps))

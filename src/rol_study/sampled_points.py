@@ -317,12 +317,14 @@ def sample_points(
         standing = _renew(standing, pose, n_kept - n_kept // 2, front_end, rng)
         riding = _renew(riding, np.zeros(3), n_kept // 2, front_end, rng)
         again = np.concatenate([transform_points(invert(pose), standing), riding])
-        yield np.concatenate([
-            _draw_near(seen, near, front_end, rng),
-            _draw_beside(seen, beside, pose, tree, rng),
-            again + rng.normal(0.0, 0.1, again.shape),
-            _draw_anywhere(false - n_kept, front_end, rng),
-        ])  # fmt: skip
+        yield np.concatenate(
+            [
+                _draw_near(seen, near, front_end, rng),
+                _draw_beside(seen, beside, pose, tree, rng),
+                again + rng.normal(0.0, 0.1, again.shape),
+                _draw_anywhere(false - n_kept, front_end, rng),
+            ]
+        )
 
 
 def _draw_near(seen: np.ndarray, n: int, front_end: FrontEnd, rng: np.random.Generator) -> np.ndarray:

@@ -163,11 +163,20 @@ def _train(patches: np.ndarray, rng: np.random.Generator, epochs: int, bf16: boo
 
     torch.manual_seed(int(rng.integers(2**31)))
     classifier = nn.Sequential(
-        nn.Conv2d(1, 16, 5, padding=2), nn.MaxPool2d(2), nn.ReLU(),  # on a quarter of the values
-        nn.Conv2d(16, 32, 3, padding=1), nn.MaxPool2d(2), nn.ReLU(),
-        nn.Conv2d(32, 48, 3, padding=1), nn.ReLU(), nn.AdaptiveAvgPool2d(1), nn.Flatten(),
-        nn.Linear(48, 32), nn.ReLU(), nn.Linear(32, 1),
-    ).to(memory_format=torch.channels_last)  # fmt: skip
+        nn.Conv2d(1, 16, 5, padding=2),
+        nn.MaxPool2d(2),
+        nn.ReLU(),  # on a quarter of the values
+        nn.Conv2d(16, 32, 3, padding=1),
+        nn.MaxPool2d(2),
+        nn.ReLU(),
+        nn.Conv2d(32, 48, 3, padding=1),
+        nn.ReLU(),
+        nn.AdaptiveAvgPool2d(1),
+        nn.Flatten(),
+        nn.Linear(48, 32),
+        nn.ReLU(),
+        nn.Linear(32, 1),
+    ).to(memory_format=torch.channels_last)
     flat = patches.reshape(2, -1, 1, ROWS, BINS)
     images = torch.from_numpy(flat.reshape(-1, 1, ROWS, BINS))
     labels = torch.cat([torch.ones(flat.shape[1]), torch.zeros(flat.shape[1])])

@@ -95,8 +95,10 @@ def test_velocities_are_those_of_the_poses(small_root: Path) -> None:
     twists = true_twists(session)
     assert len(twists) == 12
     middles = session.scans_us + session.turns_us // 2
-    np.testing.assert_allclose(session.drive.pose(middles), drive_poses(), atol=1e-3)
-    np.testing.assert_allclose(twists[1:-1, 0], np.hypot(*session.drive.velocity(middles).T)[1:-1], rtol=0.02)
+    np.testing.assert_allclose(session.trajectory.pose(middles), drive_poses(), atol=1e-3)
+    np.testing.assert_allclose(
+        twists[1:-1, 0], np.hypot(*session.trajectory.velocity(middles).T)[1:-1], rtol=0.02
+    )
 
 
 @pytest.mark.parametrize(

@@ -16,12 +16,14 @@ from dataclasses import dataclass, field, fields
 import numpy as np
 
 from rol.geometry import check_fields, check_poses
+from rol.oxford import COUNTS_PER_TURN, N_AZIMUTHS
 from rol_sim.sensors.radar_signal import echoes_to_codes, range_to_bins
 from rol_sim.sensors.radar_surfaces import Surface, SurfaceHits, scatter, surface_table
 from rol_sim.world.scene import Scene
 
-N_AZIMUTHS, N_COUNTS, FIRST_COUNT, COUNT_STEP = 400, 5600, 13, 14
-ROW_ANGLE = 2.0 * np.pi * COUNT_STEP / N_COUNTS
+# Encoder counts of the rows: 13, 27, ... 5599 of 5600.
+FIRST_COUNT, COUNT_STEP = 13, 14
+ROW_ANGLE = 2.0 * np.pi * COUNT_STEP / COUNTS_PER_TURN
 MARGIN_ROWS = 5  # the beam's flanks reach this far before the first and after the last row
 WEAKEST_ONWARD = 3.0  # a ray is followed on while a perfect scatterer would return more power than this
 
@@ -135,7 +137,7 @@ def beam_azimuths() -> np.ndarray:
         Counter-clockwise from forward, falling from -0.015 to -6.28 [rad]; the sensor's counters are 13, 27,
         ... 5599.
     """
-    return -2.0 * np.pi * (FIRST_COUNT + COUNT_STEP * np.arange(N_AZIMUTHS)) / N_COUNTS
+    return -2.0 * np.pi * (FIRST_COUNT + COUNT_STEP * np.arange(N_AZIMUTHS)) / COUNTS_PER_TURN
 
 
 def simulate_scan(
@@ -186,9 +188,14 @@ def simulate_scan(
         closing = closing - _look_up_velocities(objects, object_velocities)
     ranges = ranges - settings.doppler_seconds * np.einsum("ij,ij->i", closing, headings)
     return echoes_to_codes(
-        rows, range_to_bins(ranges), powers, rng, noise_scale=settings.noise_scale,
-        streak_scale=settings.streak_scale, interference_rate=settings.interference_rate,
-    )  # fmt: skip
+        rows,
+        range_to_bins(ranges),
+        powers,
+        rng,
+        noise_scale=settings.noise_scale,
+        streak_scale=settings.streak_scale,
+        interference_rate=settings.interference_rate,
+    )
 
 
 def emit_rays(row_poses: np.ndarray, rng: np.random.Generator, settings: RadarSettings) -> Rays:
@@ -215,7 +222,7 @@ def emit_rays(row_poses: np.ndarray, rng: np.random.Generator, settings: RadarSe
     elevations = np.deg2rad(np.array(settings.layers_deg) + (jitter[1] - 0.5) * settings.layer_widths_deg)
     at, knots = np.clip(rows, 0.0, N_AZIMUTHS - 1.0), np.arange(N_AZIMUTHS)
     x, y, yaw = (np.interp(at, knots, values) for values in (*row_poses[:, :2].T, np.unwrap(row_poses[:, 2])))
-    angle = yaw - (FIRST_COUNT + COUNT_STEP * rows) * 2.0 * np.pi / N_COUNTS
+    angle = yaw - (FIRST_COUNT + COUNT_STEP * rows) * 2.0 * np.pi / COUNTS_PER_TURN
     flat = np.cos(elevations)
     direction = np.stack([flat * np.cos(angle), flat * np.sin(angle), np.sin(elevations)], axis=-1)
     gains = 10.0 ** (np.array(settings.layer_gains_db) / 10.0) * settings.layer_widths_deg

@@ -12,13 +12,8 @@ from functools import lru_cache
 import numpy as np
 
 from rol.compiled import compiled
+from rol.oxford import N_AZIMUTHS, N_BINS
 from rol.radar import MEASURED
-
-N_AZIMUTHS, N_BINS = 400, 3768
-RANGE_RESOLUTION, RANGE_OFFSET = (
-    MEASURED.resolution_m,
-    MEASURED.offset_m,
-)  # true range = (bin + 0.5) * resolution + offset [m]
 
 # A Hann window over the chirp, its spectrum padded: one cell of the bare spectrum is this many bins.
 HANN_BINS = 5.9
@@ -107,7 +102,7 @@ def range_to_bins(ranges_m: np.ndarray) -> np.ndarray:
     bins : array, same shape
         Fractional bin, an integer at the middle of a bin.
     """
-    return (ranges_m - RANGE_OFFSET) / RANGE_RESOLUTION - 0.5
+    return (ranges_m - MEASURED.offset_m) / MEASURED.resolution_m - 0.5
 
 
 def range_response(bins: np.ndarray) -> np.ndarray:
@@ -209,7 +204,7 @@ def _block_energies(field: np.ndarray) -> np.ndarray:
 
 @lru_cache(maxsize=1)
 def _block_noise() -> np.ndarray:
-    ranges = (np.arange(-(-N_BINS // BLOCK)) + 0.5) * BLOCK * RANGE_RESOLUTION
+    ranges = (np.arange(-(-N_BINS // BLOCK)) + 0.5) * BLOCK * MEASURED.resolution_m
     return np.interp(ranges, NOISE_RANGES_M, NOISE_POWERS).astype(np.float32)
 
 

@@ -194,7 +194,8 @@ def scatter(hits, ray_spacing, tail_fraction, tail_m):  # pragma: no cover (comp
     return Echoes(echoes.turns[:count], echoes.ranges[:count], echoes.powers[:count], echoes.sources[:count])
 
 
-@compiled
+# The three functions below are inlined, since passing tuples of arrays costs a count of references for each.
+@compiled(inline="always")
 def _footprint(hits, i, ray_spacing):  # pragma: no cover (compiled)
     """Normal in the plane, coordinate along the surface, and half the width [m] that a ray stands for."""
     x, y = hits.points[i, 0], hits.points[i, 1]
@@ -209,7 +210,7 @@ def _footprint(hits, i, ray_spacing):  # pragma: no cover (compiled)
     return nx, ny, along, half
 
 
-@compiled
+@compiled(inline="always")
 def _scatter_cells(hits, i, footprint, echoes, count):  # pragma: no cover (compiled)
     """Append the echoes of the cells in a hit's footprint; returns the new count and their total power."""
     nx, ny, along, half = footprint
@@ -236,7 +237,7 @@ def _scatter_cells(hits, i, footprint, echoes, count):  # pragma: no cover (comp
     return count, total
 
 
-@compiled
+@compiled(inline="always")
 def _add_clutter_tail(hits, i, along, power, tail_m, echoes, count):  # pragma: no cover (compiled)
     """Append the echoes that took a longer path, of a given total power; returns the new count."""
     number, z = int(hits.objects[i]), int(np.floor(hits.points[i, 2]))
@@ -269,9 +270,11 @@ def _answer(surface, cosine, number, cell, z):  # pragma: no cover (compiled)
     """
     aspect = int(np.arccos(min(cosine, 1.0)) / ASPECT)
     diffuse = (
-        surface[0] * max(cosine, 1e-3) ** surface[1]
-        * _hash_exponential(number, cell, z, 3) * _hash_exponential(number, cell + 7919 * aspect, z, 10)
-    )  # fmt: skip
+        surface[0]
+        * max(cosine, 1e-3) ** surface[1]
+        * _hash_exponential(number, cell, z, 3)
+        * _hash_exponential(number, cell + 7919 * aspect, z, 10)
+    )
     specular, corner = 0.0, 0.0
     if surface[2] > 0.0:
         tilt = 0.03 * (_hash_unit(number, cell, z, 1) + _hash_unit(number, cell, z, 2) - 1.0)
