@@ -46,9 +46,11 @@ from rol.bev import image_to_points
 from rol.evaluation import KITTI_LENGTHS_M, drift_by_length, pose_errors, read_tum, rmse
 from rol.files import write_text
 from rol.geometry import accumulate_increments, compose, relative_pose, transform_points
-from rol.odometry import chain, correct_cloud, fit_rigid, icp_2d, local_map_odometry
+from rol.odometry import fit_rigid, icp_2d, scan_to_scan_icp
 from rol.pairs import generated_folder, read_image
 from rol.radar import MEASURED, SDK
+from rol_beyond.local_map_odometry import deskew_cloud, local_map_odometry
+from rol_beyond.scan_matching import correlative_scan_match
 from rol_data import rall
 
 try:
@@ -86,7 +88,7 @@ def to_step(matrix: np.ndarray) -> np.ndarray:
 def chain_peer(
     align: Align, clouds: Clouds, stamps_us: np.ndarray, heights: tuple[float, ...] = (0.0,)
 ) -> Steps:
-    """Register each cloud to the one before with a peer, as `rol.odometry.chain` does."""
+    """Register each cloud to the one before with a peer, as `rol.odometry.scan_to_scan_icp` does."""
     step, target = np.zeros(3), to_space(clouds[0], heights)
     for cloud in clouds[1:]:
         source = to_space(cloud, heights)
@@ -127,7 +129,8 @@ def ours(clouds: Clouds, stamps_us: np.ndarray, **changes: object) -> Steps:
 
 def paper(clouds: Clouds, stamps_us: np.ndarray, search: bool = False) -> Steps:
     """Steps of the paper's ICP, with or without a searched first guess."""
-    return (r.T_target_source for r in chain(clouds, search=search))
+    refine = correlative_scan_match if search else None
+    return (r.T_target_source for r in scan_to_scan_icp(clouds, refine_guess=refine))
 
 
 def paper_by_tree(clouds: Clouds, stamps_us: np.ndarray) -> Steps:
@@ -165,7 +168,7 @@ def list_ways() -> dict[str, Way]:
         "paper, k-d tree": paper_by_tree,
         "paper, searched guess": partial(paper, search=True),
         "ours": ours,
-        "ours, no correction": partial(ours, correct=None),
+        "ours, no correction": partial(ours, deskew=None),
         "Open3D point-to-point": partial(chain_peer, align_open3d),
     }
     for kind, heights in PEER_HEIGHTS_M.items() if small_gicp else ():
@@ -226,7 +229,7 @@ def judge(steps: np.ndarray, truth: np.ndarray, longest_m: float) -> dict[str, f
 def correct_all(clouds: Clouds, stamps_us: np.ndarray) -> Clouds:
     """Correct clouds with the velocities that ours finds."""
     twists = [found.twist for found in local_map_odometry(clouds, stamps_us)]
-    return [correct_cloud(c, twist) for c, twist in zip(clouds, [twists[0], *twists], strict=True)]
+    return [deskew_cloud(c, twist) for c, twist in zip(clouds, [twists[0], *twists], strict=True)]
 
 
 def find_longest(truths: list[np.ndarray]) -> float:

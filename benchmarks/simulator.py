@@ -2,7 +2,7 @@
 
 python benchmarks/simulator.py [--scans 40]      prints a table and writes build/benchmarks/simulator.json
 
-Medians over scans of one process on one thread; the sessions of a drive are written by as many processes as wanted. With
+Medians over scans of one process on one thread; the sessions of a trajectory are written by as many processes as wanted. With
 the real data at hand the world is that of the route, without them the simulated town.
 """
 
@@ -24,8 +24,8 @@ from rol_data import rall
 from rol_sim.sensors import radar as radar_sensor
 from rol_sim.sensors import radar_signal
 from rol_sim.session import oxford_files
-from rol_sim.session.assembly import SimulatedSession, build_session, make_scan, make_sweep, sensor_settings
 from rol_sim.session.settings import load_settings
+from rol_sim.session.simulation import SimulatedSession, build_session, make_scan, make_sweep, sensor_settings
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -48,7 +48,7 @@ def time_scan(session: SimulatedSession, index: int, folder: Path) -> dict[str, 
     marks = [perf_counter()]
     scene = session.scene_at(stamp + 0.5 * turn)
     marks.append(perf_counter())
-    rays = radar_sensor.emit_rays(session.drive.pose(times), rng, settings)
+    rays = radar_sensor.emit_rays(session.trajectory.pose(times), rng, settings)
     marks.append(perf_counter())
     rows, ranges, powers, _, _ = radar_sensor.trace_echoes(scene, rays, settings)
     marks.append(perf_counter())

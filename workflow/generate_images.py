@@ -1,6 +1,6 @@
 """Generate the lidar images of one session; the slow part of chapter 05, as a job of its own for each session.
 
-    python workflow/generate_images.py build/demo/pairs/NAME data/weights/rol.safetensors build/demo/fake/NAME
+    python workflow/generate_images.py build/demo/pairs/NAME data/weights/unet.safetensors build/demo/fake/NAME
 
 A run that was stopped goes on with the missing images. Chapter 05 makes the same images where they are missing.
 """
@@ -12,6 +12,7 @@ import sys
 
 import torch
 
+import rol_beyond.unet  # noqa: F401 (registers the architecture)
 from rol_beyond.generated import generate_session
 from rol_book.parameters import positive
 

@@ -1,284 +1,32 @@
-"""Measure the filter on the real route over many seeds, settings and lost starts: hours of filtering, kept as tables.
+"""Measure the filters on the real route over many seeds, settings and wrong starts: tables of hours of filtering.
 
 python workflow/measure_route.py [--real-root DIR] [--jobs 2] [--only seeds,settings,...]
 
-Writes data/ablations/route_<what>.csv row by row: a run that was stopped goes on where it ended. Chapter 09 reads these
-tables, and makes one run of each session itself.
+Writes data/ablations/route_<what>.csv row by row; a run that was stopped continues where it ended. The chapter on the
+Oxford route reads these tables, and makes one run of each session itself.
 """
 
 from __future__ import annotations
 
 import argparse
 import os
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from dataclasses import replace
-from functools import lru_cache
+from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 from pathlib import Path
 
-import numpy as np
-import pandas as pd
-
-from rol.evaluation import consistency, pose_errors, summarize
-from rol.files import write_text
-from rol.mcl import MclSettings, settings_for
-from rol_beyond.motion import MotionModel
-from rol_beyond.recovery import RecoverySettings
 from rol_book.parameters import positive
 from rol_data.rall import find_real_root
-from rol_study.route import Route, RouteRun, list_routes
-from rol_study.route_runs import (
-    Stage,
-    add_outliers,
-    draw_session,
-    kidnap,
-    run_method,
-    set_stage,
-    start_anywhere,
-)
-from rol_study.sampled_points import FrontEnd
+from rol_study.route_tables import MEASURES, list_jobs, run_table
 
-ROOT = Path(__file__).resolve().parents[1]
-SHORT = 3000  # scans of the runs that compare settings
-DEG = float(np.deg2rad(1.0))
-SETTINGS = {
-    "particles": [("n_particles", n) for n in (50, 100, 500, 2000)],
-    "lambda": [("exponent", value) for value in (1.0, 5.0, 20.0, 80.0)],
-    "d_th [m]": [("d_th_m", value) for value in (0.25, 0.5, 1.0, 2.0)],
-    "noise": [("noise", value) for value in (0.2, 0.5, 1.0, 2.0)],
-}
-INGREDIENTS = {
-    "all of rol": {},
-    "all places of the map alike": {"crowd_m": 0.0},
-    "a hard threshold": {"likelihood": "count", "crowd_m": 0.0},
-    "plain resampling after each scan": {"resampling": "multinomial", "resample_below": 1.0},
-    "lambda of 60": {"exponent": 60.0},
-}
-UNTAUGHT = "motion as measured, not learnt"
-WATCHES = {  # ingredients that are no settings of the filter itself
-    "without recovery": {"doubt": -np.inf, "lost": -np.inf},
-    "standing scans count in full": {"still_share": 1.0},
-}
-INGREDIENTS |= {name: {} for name in (*WATCHES, UNTAUGHT)}
-NARROW = {"d_th_m": 0.25}
-QUIET = {"noise_forward_m": 0.1, "noise_side_m": 0.06, "noise_yaw_rad": 0.2 * DEG}
-TUNED = {"both": NARROW | QUIET, "d_th of 0.25 m": NARROW, "a fifth of the noise": QUIET}
-FRONTS = ((0.40, 0.60), (0.50, 0.70), (0.65, 0.80), (0.80, 0.90))
-
-
-@lru_cache(maxsize=1)
-def stage_of(
-    real_root: str,
-    number: str,
-    shares: tuple[float, float] = (0.40, 0.60),
-    max_scans: int = 0,
-    settings: MclSettings | None = None,
-) -> Stage:
-    """Set the stage once per worker and session."""
-    return set_stage(real_root, number, FrontEnd(*shares), max_scans=max_scans, settings=settings)
-
-
-def row_of(stage: Stage, run: RouteRun, method: str, seed: int) -> dict:
-    """Figures of merit of one run."""
-    truth, errors = stage.route.truth, pose_errors(run.poses, stage.route.truth)
-    row = summarize(
-        run.poses, truth, method=method, session=stage.route.number, failures=len(run.failures),
-        update_ms_median=float(np.median(run.update_ms)), seed=seed,
-    )  # fmt: skip
-    return row | {
-        "median_m": float(np.median(errors.position_m)),
-        "median_yaw_deg": float(np.rad2deg(np.median(np.abs(errors.yaw_rad)))),
-        "largest_m": float(errors.position_m.max()),
-        "lost_share": float(run.is_lost.mean()),
-        "n_particles": float(run.n_particles.mean()),
-        **(consistency(run.poses, truth, run.covariances) if np.isfinite(run.covariances).all() else {}),
-    }
-
-
-def measure(real_root: str, what: str, key: tuple) -> list[dict]:
-    """Make one job; give its rows, each with the job's key."""
-    rows = MEASURES[what](real_root, *key)
-    return [{"job": " ".join(map(str, key)), **row} for row in rows]
-
-
-def measure_seeds(real_root: str, number: str, seed: int) -> list[dict]:
-    """Both methods over a whole session."""
-    stage = stage_of(real_root, number)
-    clouds = draw_session(stage, seed)
-    return [
-        row_of(stage, run_method(stage, method, clouds, seed), method, seed) for method in ("paper", "rol")
-    ]
-
-
-def measure_settings(real_root: str, number: str, seed: int) -> list[dict]:
-    """The method `paper` with one setting after the other changed."""
-    stage, rows = stage_of(real_root, number, (0.40, 0.60), SHORT), []
-    clouds = draw_session(stage, seed)
-    for name, values in SETTINGS.items():
-        for setting, value in values:
-            noise = {
-                "noise_forward_m": 0.5 * value,
-                "noise_side_m": 0.3 * value,
-                "noise_yaw_rad": value * DEG,
-            }
-            run = run_method(
-                stage, "paper", clouds, seed, **(noise if setting == "noise" else {setting: value})
-            )
-            rows.append({"what": name, "value": value, **row_of(stage, run, "paper", seed)})
-    return rows
-
-
-def measure_ingredients(real_root: str, number: str, without: str, seed: int) -> list[dict]:
-    """The method `rol` over a whole session with one of its ingredients changed."""
-    changes = INGREDIENTS[without]
-    stage = stage_of(real_root, number, settings=settings_for("rol", **changes))
-    if without == UNTAUGHT:
-        stage = replace(stage, model=MotionModel())
-    recovery = RecoverySettings(stage.level, **WATCHES.get(without, {}))
-    run = run_method(stage, "rol", draw_session(stage, seed), seed, recovery=recovery, **changes)
-    return [{"without": without, **row_of(stage, run, "rol", seed)}]
-
-
-def measure_tuned(real_root: str, number: str, what: str, seed: int) -> list[dict]:
-    """The method `paper` over a whole session with the settings that were best on the first scans of session 02."""
-    stage = stage_of(real_root, number)
-    run = run_method(stage, "paper", draw_session(stage, seed), seed, **TUNED[what])
-    return [{"what": what, **row_of(stage, run, "tuned", seed)}]
-
-
-def measure_registration(real_root: str, number: str, seed: int) -> list[dict]:
-    """Registration on the map without a filter, over a whole session."""
-    stage = stage_of(real_root, number)
-    run = run_method(stage, "registration", draw_session(stage, seed), seed)
-    return [row_of(stage, run, "registration", seed)]
-
-
-def measure_fronts(real_root: str, number: str, share_1m: float, share_2m: float, seed: int) -> list[dict]:
-    """Both methods with better and better front ends."""
-    stage = stage_of(real_root, number, (share_1m, share_2m), SHORT)
-    clouds, shares = draw_session(stage, seed), {"share_1m": share_1m, "share_2m": share_2m}
-    return [shares | row_of(stage, run_method(stage, m, clouds, seed), m, seed) for m in ("paper", "rol")]
-
-
-def measure_outliers(real_root: str, number: str, share: float, seed: int) -> list[dict]:
-    """Both methods with steps that are plainly wrong."""
-    stage = stage_of(real_root, number, (0.40, 0.60), SHORT)
-    spoiled = replace(stage, route=add_outliers(stage.route, share, np.random.default_rng(seed)))
-    clouds = draw_session(stage, seed)
-    return [
-        {"share": share} | row_of(spoiled, run_method(spoiled, m, clouds, seed), m, seed)
-        for m in ("paper", "rol")
-    ]
-
-
-def measure_rendered(real_root: str, number: str, first: int, n_scans: int, seed: int) -> list[dict]:
-    """Both methods with the simulated radar through the translator, on a stretch where it never learnt."""
-    import torch
-
-    from rol.pix2pix import load_network
-    from rol_study.rendered_points import render_clouds
-
-    torch.set_num_threads(1)
-    stage = stage_of(real_root, number, (0.80, 0.88))
-    translator = load_network(ROOT / "data" / "weights" / "rol.safetensors")
-    clouds = list(render_clouds(real_root, number, first, n_scans, translator, seed))
-    truth, steps = stage.route.truth[first : first + n_scans], stage.route.steps[first : first + n_scans - 1]
-    part = replace(stage, route=Route(number, truth, steps))
-    return [row_of(part, run_method(part, method, clouds, seed), method, seed) for method in ("paper", "rol")]
-
-
-def measure_trial(what: str):
-    """Give the measure of one lost start."""
-
-    def trial(real_root: str, number: str, first: int, seed: int) -> list[dict]:
-        found = {"kidnapped": kidnap, "anywhere": start_anywhere}[what](
-            stage_of(real_root, number), first, seed
-        )[0]
-        return [{"session": number, "first": first, "seed": seed, **vars(found)}]
-
-    return trial
-
-
-MEASURES = {
-    "seeds": measure_seeds,
-    "settings": measure_settings,
-    "fronts": measure_fronts,
-    "ingredients": measure_ingredients,
-    "tuned": measure_tuned,
-    "registration": measure_registration,
-    "outliers": measure_outliers,
-    "rendered": measure_rendered,
-    "kidnapped": measure_trial("kidnapped"),
-    "anywhere": measure_trial("anywhere"),
-}
-
-
-def list_jobs(real_root: str) -> dict[str, list[tuple]]:
-    """List the jobs of each table. Places of lost starts are drawn once, from all sessions but the mapping one."""
-    numbers, rng = list_routes(real_root), np.random.default_rng(2020)
-    driven = [number for number in numbers if number != "01"] or numbers
-    lengths = {number: len(stage_length(real_root, number)) for number in driven}
-
-    def places(n: int, seconds: float) -> list[tuple]:
-        picked = [driven[k % len(driven)] for k in range(n)]
-        return sorted(
-            (name, int(rng.integers(100, lengths[name] - 4 * seconds)), k) for k, name in enumerate(picked)
-        )
-
-    first = driven[0]
-    return {
-        "seeds": [(number, seed) for seed in range(1, 11) for number in numbers],
-        "kidnapped": places(100, 15),
-        "settings": [(first, seed) for seed in (1, 2, 3)],
-        "outliers": [(first, share, seed) for share in (0.015, 0.05) for seed in (1, 2, 3)],
-        "anywhere": places(50, 120),
-        "ingredients": [(driven[-1], name, seed) for name in INGREDIENTS for seed in (1, 2, 3, 4, 5)],
-        "tuned": list_tuned(numbers),
-        "registration": [(number, seed) for seed in (1, 2) for number in numbers],
-        "fronts": [(first, *shares, seed) for shares in FRONTS for seed in (1, 2, 3)],
-        "rendered": [key for key in (("02", 6000, 400, 1), ("07", 5050, 400, 1)) if key[0] in numbers],
-    }
-
-
-def list_tuned(numbers: list[str]) -> list[tuple]:
-    """List the jobs with better settings, away from the session that they were chosen on."""
-    judged = [number for number in numbers if number != "02"]
-    return [(number, what, seed) for number in judged for what in TUNED for seed in (1, 2, 3)]
-
-
-def stage_length(real_root: str, number: str) -> np.ndarray:
-    """Poses of a session, for their number."""
-    from rol_data.rall import POSES_PATH, load_poses
-
-    return load_poses(Path(real_root, POSES_PATH, f"pose_xy_{number}.txt"))
-
-
-def run_table(pool: ProcessPoolExecutor, real_root: str, what: str, jobs: list[tuple]) -> None:
-    """Make the jobs that a table lacks, and write the table anew after each."""
-    path = ROOT / "data" / "ablations" / f"route_{what}.csv"
-    table = (
-        pd.read_csv(path, dtype={"session": str, "job": str}) if path.is_file() else pd.DataFrame({"job": []})
-    )
-    wanted = [" ".join(map(str, key)) for key in jobs]
-    table = table[table.job.isin(wanted)]
-    missing = [key for key, name in zip(jobs, wanted, strict=True) if name not in set(table.job)]
-    running = [pool.submit(measure, real_root, what, key) for key in missing]
-    for done, future in enumerate(as_completed(running), start=1):
-        rows = future.result()
-        table = (
-            pd.concat([table, pd.DataFrame(rows)], ignore_index=True) if len(table) else pd.DataFrame(rows)
-        )
-        table = table.sort_values("job", kind="stable")
-        write_text(path, table.to_csv(index=False, float_format="%.5g"))
-        print(f"{what} {done}/{len(missing)}: {rows[0]['job']}", flush=True)
+DATA = Path(__file__).resolve().parents[1] / "data"
 
 
 def main() -> None:
-    """Measure what is asked for."""
+    """Measure the requested tables."""
     parser = argparse.ArgumentParser(description="Measure the filter on the real route.")
     parser.add_argument("--real-root", default="", help="folder of the real data")
     parser.add_argument("--jobs", type=positive, default=2, help="processes")
-    parser.add_argument("--only", default=",".join(MEASURES), help="tables to make")
+    parser.add_argument("--only", default=",".join(MEASURES), help="tables to measure")
     given = parser.parse_args()
     if unknown := set(given.only.split(",")) - set(MEASURES):
         parser.error(f"--only: no table {min(unknown)!r}; there are: {', '.join(MEASURES)}")
@@ -287,10 +35,11 @@ def main() -> None:
         raise SystemExit("the real map is not at hand: run `make real`, or give --real-root")
     for threads in ("NUMBA_NUM_THREADS", "OMP_NUM_THREADS"):
         os.environ.setdefault(threads, "1")  # of each process of the pool; here it would come too late
+    files = {"real_root": str(root), "weights": str(DATA / "weights" / "unet.safetensors")}
     with ProcessPoolExecutor(given.jobs, mp_context=get_context("spawn")) as pool:
         for what, jobs in list_jobs(str(root)).items():
             if what in given.only.split(","):
-                run_table(pool, str(root), what, jobs)
+                run_table(pool, what, jobs, DATA / "ablations" / f"route_{what}.csv", **files)
 
 
 if __name__ == "__main__":

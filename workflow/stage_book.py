@@ -211,8 +211,8 @@ def stage_result_figure(config: dict, book: Path) -> None:
 # ---- table of contents ----------------------------------------------------------------------------------------
 
 
-def expand_contents(contents: dict, pages: dict[str, Run], modules: list[str]) -> dict:
-    """Replace every chapter in the table of contents by its pages, and list the pages of the modules."""
+def expand_contents(contents: dict, pages: dict[str, Run], toolbox: list[dict]) -> dict:
+    """Replace every chapter in the table of contents by its pages, and add the entries of the toolbox."""
     for part in contents["parts"]:
         entries = []
         for entry in part["chapters"]:
@@ -222,7 +222,7 @@ def expand_contents(contents: dict, pages: dict[str, Run], modules: list[str]) -
                     {"file": f"notebooks/{page}"} for page, run in pages.items() if run.chapter == name
                 ]
             elif entry["file"] == "toolbox/index":
-                entries.append(entry | {"sections": [{"file": f"toolbox/{module}"} for module in modules]})
+                entries.append(entry | {"sections": toolbox})
             else:
                 entries.append(entry)
         part["chapters"] = entries
@@ -375,13 +375,13 @@ def stage(config_path: str) -> Path:
     shutil.copytree(ROOT / "book", book, ignore=shutil.ignore_patterns("._*"), dirs_exist_ok=True)
     stage_notebooks(config, book)
     stage_result_figure(config, book)
-    modules = stage_toolbox(book)
+    toolbox = stage_toolbox(book)
     write_text(book / "made.md", how_made_page(config, config_path))
     write_text(book / "did_it_reproduce.md", reproduced_page(config))
     pages = book_pages(config)
     for page in book.glob("*.md"):
         write_text(page, point_to_pages(read_text(page), pages))
-    contents = expand_contents(yaml.safe_load(read_text(book / "_toc.yml")), pages, modules)
+    contents = expand_contents(yaml.safe_load(read_text(book / "_toc.yml")), pages, toolbox)
     write_text(book / "_toc.yml", yaml.safe_dump(contents, sort_keys=False))
     stage_settings(book, os.environ)
     return book

@@ -22,7 +22,7 @@ def compiled(function: Callable | None = None, **options: Any) -> Callable:
     function : callable, optional
         The function; absent when the decorator is called with options.
     **options
-        Options of ``numba.njit``, such as ``parallel=True``.
+        Options of ``numba.njit``, such as ``nogil=True``.
 
     Returns
     -------

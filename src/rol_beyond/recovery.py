@@ -1,82 +1,65 @@
-"""Localization that notices when it is lost, says so, and finds the pose again, without the truth and without a hand.
+"""Localization that detects when it is lost, reports it, and relocalizes without ground truth or manual resets.
 
-Two questions are asked of every scan. *Does it fit better here than it would by chance?* The excess of a cloud at the
-estimate (`rol_beyond.search.measure_excess`), averaged over two seconds, is held against what it is at a right pose. *Does it
-fit better elsewhere?* When the answer to the first is doubtful, poses around are searched for with the clouds of the
-last seconds, and each good one becomes a rival: a small filter of its own that follows the car. A rival that fits
-better than the estimate, scan after scan and on scans that had no part in finding it, takes its place.
+Two tests are made with every scan. First, does the scan match better at the estimate than by chance? The score contrast
+(`rol_beyond.search.score_contrast`), averaged over two seconds, is normalized by its value at correct poses. Second, does
+it match better elsewhere? When the normalized score is low, poses around the estimate are searched with the scans of the
+last seconds. Each good one becomes a hypothesis, a small particle filter of its own. A hypothesis that matches better than
+the estimate over several scans, none of which was used to find it, replaces the estimate.
 
-A wrong place may fit well for seconds (a street is like itself farther on), so nothing is decided on one scan. And a
-car that stands sees the same false points again and again, so once the filter has been sure of its place, only scans
-that were made on the move can make it doubt.
+A wrong place may match for seconds, as streets repeat themselves, so no decision is based on one scan. A stationary vehicle
+observes the same false points again and again. So once an estimate is trusted, only scans taken while moving count against
+it.
 """
 
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from collections.abc import Iterable
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from rol.geometry import check_fields, check_poses, first_of_cells, wrap_angle
-
-if TYPE_CHECKING:
-    from rol.mcl import MapGrid, MclSettings, MclUpdate
-
-Move = Callable[[np.ndarray, np.ndarray, np.random.Generator], np.ndarray]
+from rol.mcl import (
+    MapGrid,
+    MclSettings,
+    MclUpdate,
+    count_matches,
+    log_weights,
+    normalize_weights,
+    predict,
+    sample_particles,
+    update,
+)
+from rol_beyond.likelihood_field import build_likelihood_field
+from rol_beyond.motion import MotionModel
+from rol_beyond.resampling import resample_systematic
+from rol_beyond.search import (
+    SearchSettings,
+    merge_clouds,
+    remove_ego_static_points,
+    score_contrast,
+    search_poses,
+    suppress_neighbours,
+)
 
 
 @dataclass(frozen=True)
-class RecoverySettings:
-    """When to doubt, where to search, and when to believe; each default gives its reason.
+class DetectionSettings:
+    """Thresholds on the normalized score of the estimate.
 
     Attributes
     ----------
-    level : float
-        Median excess of a scan at its right pose, see `measure_level`; the limits below are shares of it.
-    doubt, lost : float
-        Below these shares of the level, rivals are looked for, and the filter says that it is lost. At right poses of
-        the real route, 5 % of the averages over two seconds fall below 0.6 and 1 % below 0.3; 20 m and 20 deg off,
-        95 % are below 0.2.
-    scans : int
-        Scans that are averaged. 8: two seconds.
-    trial : int
-        Scans over which a rival must have been followed. 12: three seconds.
-    margin, trusted_margin : float
-        By this share of the level, on average over the trial, it must fit better than the estimate; the second where
-        the estimate has been in good health before.
-    unique, far_unique : float
-        And by this share better than every other rival: a street that is like itself gives no answer, so wait. The
-        second holds for rivals from far, of which there are many more.
+    search_below, lost_below : float
+        Normalized scores below which hypotheses are searched, and below which the filter reports that it is lost. At
+        correct poses on the real route 5 % of the averages over two seconds are below 0.6 and 1 % below 0.3; 20 m and
+        20 deg off, 95 % are below 0.2. Minus infinity switches a test off.
+    n_scans : int
+        Scans averaged. 8: two seconds.
     trust_m : float
-        After so long a way in good health an estimate is trusted, until a rival takes its place [m].
+        After this distance with a high score an estimate is trusted, until a hypothesis replaces it [m].
     moved_m : float
-        A scan counts, for an estimate that has been in good health, when the car has moved so far since the last one
-        that did [m].
-    window, window_m : int, float
-        Clouds that are laid together for a search, and the way over which they may reach [m]. 16: in four seconds the
-        odometry turns by less than a degree.
-    pause, trusted_pause, far_pause : int
-        Scans between two searches: near, near while the estimate is trusted, and far.
-    max_range_m : float
-        Points farther off than this are left out of a search: the heading is not known well enough for them [m].
-    reach_m, reach_yaw : float
-        Where is searched, about the estimate [m, rad].
-    far_after : int
-        After so many scans in a row of being lost the search goes far, until a place is trusted. 120: half a minute.
-    far_m : float
-        Reach of the far search, in all headings [m].
-    n_rivals, n_far_rivals : int
-        Rivals at most, near and far.
-    rival_particles : int
-        Particles of each.
-    workers : int
-        Threads of a search.
-    still_m, still_share : float
-        While a step is shorter than this [m], a scan weighs with this share of the exponent: a car that stands sees the
-        same false points again and again, and its scans are one witness rather than many.
+        A scan counts, for a trusted estimate, when the vehicle has moved this far since the last one that did [m].
 
     Raises
     ------
@@ -84,61 +67,166 @@ class RecoverySettings:
         If a value is out of its range; the message names it.
     """
 
-    level: float
-    doubt: float = 0.5
-    lost: float = 0.35
-    scans: int = 8
-    trial: int = 12
-    margin: float = 0.25
-    trusted_margin: float = 0.5
-    unique: float = 0.1
-    far_unique: float = 0.25
+    search_below: float = 0.5
+    lost_below: float = 0.35
+    n_scans: int = 8
     trust_m: float = 4.0
     moved_m: float = 0.5
-    window: int = 16
-    window_m: float = 20.0
-    pause: int = 2
-    trusted_pause: int = 12
-    far_pause: int = 20
-    max_range_m: float = 40.0
-    reach_m: float = 30.0
-    reach_yaw: float = np.deg2rad(30.0)
-    far_after: int = 120
-    far_m: float = 300.0
-    n_rivals: int = 20
-    n_far_rivals: int = 100
-    rival_particles: int = 50
-    workers: int = 1
-    still_m: float = 0.05
-    still_share: float = 0.25
 
     def __post_init__(self) -> None:
         allowed = {
-            "(0, inf)": "level window_m reach_m far_m",
-            "(0, inf]": "max_range_m",
-            "[-inf, 1]": "doubt lost",  # minus infinity: never
-            "[0, inf]": "margin trusted_margin unique far_unique trust_m moved_m still_m",
-            "[1, inf)": "scans trial n_rivals n_far_rivals rival_particles workers",
-            "[2, inf)": "window",
-            "[0, inf)": "pause trusted_pause far_pause far_after",
-            "(0, 3.15]": "reach_yaw",  # all headings are pi
-            "(0, 1]": "still_share",
+            "[-inf, 1]": "search_below lost_below",
+            "[1, inf)": "n_scans",
+            "[0, inf]": "trust_m moved_m",
         }
         check_fields(self, allowed)
 
 
 @dataclass(frozen=True)
-class Rivals:
-    """Poses that may be right, each a small filter.
+class RelocalizationSettings:
+    """Window and schedule of the searches for hypotheses.
+
+    Attributes
+    ----------
+    n_clouds, length_m : int, float
+        Scans merged for a search, and the distance over which they may extend [m]. 16: in four seconds the odometry drifts
+        by less than one degree.
+    max_range_m : float
+        Points farther away are left out, as the heading is too uncertain for them [m].
+    pause, trusted_pause, far_pause : int
+        Scans between two searches: near, near while the estimate is trusted, and far.
+    reach_m, reach_yaw : float
+        Half the extent of the near search around the estimate [m, rad].
+    far_after : int
+        After this number of scans in a row with a score below ``lost_below`` the search is far, until an estimate is
+        trusted. 120: half a minute.
+    far_reach_m : float
+        Half the extent of the far search, in all headings [m].
+    workers : int
+        Threads of a search.
+
+    Raises
+    ------
+    ValueError
+        If a value is out of its range; the message names it.
+    """
+
+    n_clouds: int = 16
+    length_m: float = 20.0
+    max_range_m: float = 40.0
+    pause: int = 2
+    trusted_pause: int = 12
+    far_pause: int = 20
+    reach_m: float = 30.0
+    reach_yaw: float = float(np.deg2rad(30.0))
+    far_after: int = 120
+    far_reach_m: float = 300.0
+    workers: int = 1
+
+    def __post_init__(self) -> None:
+        allowed = {
+            "[2, inf)": "n_clouds",
+            "(0, inf)": "length_m reach_m far_reach_m",
+            "(0, inf]": "max_range_m",
+            "[0, inf)": "pause trusted_pause far_pause far_after",
+            "(0, 3.15]": "reach_yaw",
+            "[1, inf)": "workers",
+        }
+        check_fields(self, allowed)
+
+
+@dataclass(frozen=True)
+class ConfirmationSettings:
+    """Hypotheses, and the tests that one passes before it replaces the estimate.
+
+    Attributes
+    ----------
+    n_scans : int
+        Scans over which a hypothesis is followed first. 12: three seconds.
+    margin, trusted_margin : float
+        Fraction of the reference contrast by which it must match better than the estimate, on average over these scans;
+        the second value for a trusted estimate.
+    uniqueness, far_uniqueness : float
+        Fraction by which it must match better than every other hypothesis: in a repetitive street there is no decision
+        yet. The second value for far hypotheses, of which there are many more.
+    n_hypotheses, n_far_hypotheses : int
+        Largest number of hypotheses, near and far.
+    n_particles : int
+        Particles of each.
+
+    Raises
+    ------
+    ValueError
+        If a value is out of its range; the message names it.
+    """
+
+    n_scans: int = 12
+    margin: float = 0.25
+    trusted_margin: float = 0.5
+    uniqueness: float = 0.1
+    far_uniqueness: float = 0.25
+    n_hypotheses: int = 20
+    n_far_hypotheses: int = 100
+    n_particles: int = 50
+
+    def __post_init__(self) -> None:
+        allowed = {
+            "[1, inf)": "n_scans n_hypotheses n_far_hypotheses n_particles",
+            "[0, inf]": "margin trusted_margin uniqueness far_uniqueness",
+        }
+        check_fields(self, allowed)
+
+
+@dataclass(frozen=True)
+class RecoverySettings:
+    """Settings of `RecoveringFilter`.
+
+    Attributes
+    ----------
+    reference_contrast : float
+        Median score contrast of a scan at its correct pose, see `measure_reference_contrast`.
+    stationary_m : float
+        An increment shorter than this is that of a stationary vehicle [m].
+    stationary_weight : float
+        Factor on the exponent of Eq. 8 for a stationary vehicle, whose scans show the same false points again and again
+        and are not independent.
+    detection, relocalization, confirmation
+        See their classes.
+
+    Raises
+    ------
+    ValueError
+        If a value is out of its range; the message names it.
+    """
+
+    reference_contrast: float
+    stationary_m: float = 0.05
+    stationary_weight: float = 0.25
+    detection: DetectionSettings = field(default_factory=DetectionSettings)
+    relocalization: RelocalizationSettings = field(default_factory=RelocalizationSettings)
+    confirmation: ConfirmationSettings = field(default_factory=ConfirmationSettings)
+
+    def __post_init__(self) -> None:
+        allowed = {
+            "(0, inf)": "reference_contrast",
+            "[0, inf]": "stationary_m",
+            "(0, 1]": "stationary_weight",
+        }
+        check_fields(self, allowed)
+
+
+@dataclass(frozen=True)
+class Hypotheses:
+    """Alternative poses, each a small particle filter.
 
     Attributes
     ----------
     particles : array, shape (h, k, 3)
         Particles of each [m, m, rad].
     weights : array, shape (h, k)
-        Their weights, which sum to one for each rival.
+        Their weights, which sum to one for each hypothesis.
     scores : array, shape (h, t)
-        Excess of the last scans, the latest last; NaN before the rival was found.
+        Score contrast of the last scans, the latest last; NaN before the hypothesis was found.
     """
 
     particles: np.ndarray
@@ -158,60 +246,125 @@ class Rivals:
 
     @property
     def ages(self) -> np.ndarray:
-        """Scans for which each was followed, shape (h,); not more than are kept."""
+        """Scans for which each was followed, shape (h,); at most as many as scores are kept."""
         return np.isfinite(self.scores).sum(axis=1)
 
     @property
     def means(self) -> np.ndarray:
-        """Mean excess of each, shape (h,)."""
+        """Mean score contrast of each, shape (h,)."""
         return np.nansum(self.scores, axis=1) / np.maximum(self.ages, 1)
 
-    def keep(self, chosen: np.ndarray) -> Rivals:
-        """Give some of them, chosen by a mask or by numbers."""
-        return Rivals(self.particles[chosen], self.weights[chosen], self.scores[chosen])
+    def keep(self, chosen: np.ndarray) -> Hypotheses:
+        """Select some of them by a mask or by indices."""
+        return Hypotheses(self.particles[chosen], self.weights[chosen], self.scores[chosen])
+
+    def predict(self, increment: np.ndarray, motion: MotionModel, rng: np.random.Generator) -> Hypotheses:
+        """Move all particles by an odometry increment (Eq. 7)."""
+        if not len(self):
+            return self
+        moved = predict(self.particles.reshape(-1, 3), increment, motion, rng)
+        return replace(self, particles=moved.reshape(self.particles.shape))
+
+    def update(
+        self, points: np.ndarray, grid: MapGrid, exponent: float, rng: np.random.Generator
+    ) -> tuple[Hypotheses, np.ndarray]:
+        """Weight and resample the particles of each by one scan; return the score contrasts, too, shape (h,)."""
+        if not len(self) or not len(points):
+            return self, np.zeros(len(self))
+        h, k, _ = self.particles.shape
+        sums = count_matches(self.particles.reshape(-1, 3), points, grid)
+        logs = log_weights(sums.reshape(h, k), exponent)
+        weights = np.array([normalize_weights(*row)[0] for row in zip(logs, self.weights, strict=True)])
+        updated = Hypotheses(self.particles.copy(), weights, self.scores)
+        contrasts = score_contrast(updated.poses, points, grid)
+        for i in np.flatnonzero(1.0 / np.sum(weights**2, axis=1) < 0.5 * k):
+            updated.particles[i] = updated.particles[i, resample_systematic(weights[i], rng)]
+            weights[i] = 1.0 / k
+        return updated, contrasts
+
+    def record(self, contrasts: np.ndarray) -> Hypotheses:
+        """Append the score contrasts of one scan, shape (h,)."""
+        return replace(self, scores=np.column_stack([self.scores[:, 1:], contrasts]))
+
+    def without_duplicates(self, pose: np.ndarray) -> Hypotheses:
+        """Remove hypotheses that have converged to the estimate or to a better hypothesis."""
+        if not len(self):
+            return self
+        known, rank = np.vstack([pose[None], self.poses]), np.append(np.inf, self.means)
+        order = np.argsort(-rank, kind="stable")
+        kept = suppress_neighbours(known, order, len(known), (1.0, np.deg2rad(3.0)))
+        return self.keep(np.array(sorted(kept)[1:], dtype=int) - 1)
+
+    def add(self, found: np.ndarray, pose: np.ndarray, n: int, rng: np.random.Generator) -> Hypotheses:
+        """Add poses that are neither the estimate nor a hypothesis yet, up to n in all; the worst old ones go."""
+        known = np.vstack([pose[None], self.poses])
+        away = np.abs(found[:, None] - known[None])
+        away[..., 2] = np.abs(wrap_angle(away[..., 2]))
+        is_new = ~((away[..., :2] < 1.5).all(axis=-1) & (away[..., 2] < np.deg2rad(4.0))).any(axis=1)
+        fresh = check_poses(found[is_new], "found poses")
+        k, t = self.particles.shape[1], self.scores.shape[1]
+        spread = 0.3, 0.3, np.deg2rad(0.7)
+        particles = fresh[:, None] + rng.standard_normal((len(fresh), k, 3)) * spread
+        weights, scores = np.full((len(fresh), k), 1.0 / k), np.full((len(fresh), t), np.nan)
+        old = self.keep(np.argsort(-self.means, kind="stable")[: max(n // 2, n - len(fresh))])
+        pairs = (old.particles, particles), (old.weights, weights), (old.scores, scores)
+        return Hypotheses(*(np.concatenate([a, b[: n - len(old)]]) for a, b in pairs))
+
+
+def no_hypotheses(settings: ConfirmationSettings) -> Hypotheses:
+    """Make an empty set of hypotheses."""
+    k, t = settings.n_particles, settings.n_scans
+    return Hypotheses(np.zeros((0, k, 3)), np.zeros((0, k)), np.zeros((0, t)))
 
 
 @dataclass(frozen=True)
 class RecoveryUpdate:
-    """One scan's estimate, and what the filter thinks of it.
+    """Estimate after one scan, with its assessment.
 
     Attributes
     ----------
     filter : MclUpdate
-        The filter's own update; its ``pose`` is the estimate.
-    covariance : array, shape (3, 3)
-        Of the estimate (x, y, yaw) in the map frame [m, rad].
-    excess : float
-        How much better than by chance the cloud fits at the estimate.
-    health : float
-        Its average over the last scans as a share of the level: about 1 where all is well.
+        The particle filter's update.
+    score_contrast : float
+        Score contrast of the scan at the estimate.
+    normalized_score : float
+        Its average over the last scans, divided by the reference contrast: about 1 at a correct pose.
     is_lost : bool
-        The filter does not vouch for this estimate.
-    n_rivals : int
-        Rivals that are followed.
+        The filter reports that the estimate may be wrong.
+    n_hypotheses : int
+        Hypotheses followed.
     n_particles : int
-        Particles of the filter and of its rivals.
+        Particles of the filter and of the hypotheses.
     was_replaced : bool
-        A rival took over after this scan.
+        A hypothesis replaces the estimate after this scan.
     """
 
     filter: MclUpdate
-    covariance: np.ndarray
-    excess: float
-    health: float
+    score_contrast: float
+    normalized_score: float
     is_lost: bool
-    n_rivals: int
+    n_hypotheses: int
     n_particles: int
     was_replaced: bool
 
+    @property
+    def pose(self) -> np.ndarray:
+        """Estimate T_map_radar, shape (3,) [m, m, rad]."""
+        return self.filter.pose
 
-def measure_level(clouds: Iterable[np.ndarray], poses: np.ndarray, grid: MapGrid) -> float:
-    """Measure the median excess of clouds at poses that are known to be right.
+    @property
+    def covariance(self) -> np.ndarray:
+        """Covariance of (x, y, yaw), shape (3, 3) [m, m, rad]."""
+        return self.filter.covariance
+
+
+def measure_reference_contrast(clouds: Iterable[np.ndarray], poses: np.ndarray, grid: MapGrid) -> float:
+    """Measure the median score contrast of scans at correct poses.
 
     Parameters
     ----------
     clouds : iterable of array, shape (m, 2)
-        Clouds in the radar frame [m], of a drive other than the one to be localized.
+        Scans of another session than the one to be localized, in the radar frame [m].
     poses : array, shape (n, 3)
         Their poses T_map_radar [m, m, rad].
     grid : MapGrid
@@ -219,354 +372,266 @@ def measure_level(clouds: Iterable[np.ndarray], poses: np.ndarray, grid: MapGrid
 
     Returns
     -------
-    level : float
+    reference_contrast : float
 
     Raises
     ------
     ValueError
-        If the clouds fit no better than by chance: wrong poses, or the wrong map.
+        If the scans match no better than by chance: wrong poses, or the wrong map.
     """
-    from rol_beyond.search import measure_excess
-
-    found = [measure_excess(pose[None], cloud, grid)[0] for cloud, pose in zip(clouds, poses, strict=True)]
-    level = float(np.median(found)) if found else 0.0
-    if level <= 0.0:
-        raise ValueError(f"level: the clouds exceed chance by {level:.3f} at the poses given, so not at all")
-    return level
-
-
-@dataclass
-class _State:
-    """What is carried from scan to scan."""
-
-    particles: np.ndarray
-    weights: np.ndarray
-    rivals: Rivals
-    clouds: deque
-    steps: deque
-    scores: deque
-    since_search: int = 10**6
-    n_lost: int = 0
-    is_far: bool = False
-    is_trusted: bool = False
-    moved_m: float = 0.0
-    well_m: float = 0.0
-    searched_m: float = 1e9
-    coarse: MapGrid | None = None
+    found = [score_contrast(pose[None], cloud, grid)[0] for cloud, pose in zip(clouds, poses, strict=True)]
+    median = float(np.median(found)) if found else 0.0
+    if median <= 0.0:
+        raise ValueError(
+            f"reference contrast: {median:.3f} at the given poses; the scans match by chance only"
+        )
+    return median
 
 
-def localize_with_recovery(
-    steps: Iterable[np.ndarray],
-    clouds: Iterable[np.ndarray],
-    map_points: np.ndarray,
-    start: np.ndarray,
-    settings: MclSettings,
-    recovery: RecoverySettings,
-    move: Move,
-    rng: np.random.Generator,
-    *,
-    is_start_known: bool = True,
-    grid: MapGrid | None = None,
-) -> Iterator[RecoveryUpdate]:
-    """Run the filter scan by scan, watch over it, and find the pose again where it was lost.
+class RecoveringFilter:
+    """Particle filter with failure detection and relocalization, given one scan at a time.
 
     Parameters
     ----------
-    steps : iterable of array, shape (3,)
-        Odometry between successive scans, one fewer than clouds [m, m, rad].
-    clouds : iterable of array, shape (m, 2)
-        Cloud of each scan in the radar frame [m].
     map_points : array, shape (m, 2)
         Points of the map [m].
     start : array-like, shape (3,)
         Pose T_map_radar at the first scan [m, m, rad]; it may be wrong.
     settings : MclSettings
-        Of the filter, see `rol.mcl.settings_for`.
+        Of the filter, such as ``rol_beyond.robust.settings_for("robust", motion=MotionModel())``. The motion is a
+        `MotionModel` and the resampling a `KldResampling`.
     recovery : RecoverySettings
-        See there.
-    move : callable
-        Moves particles by a step, such as `rol_beyond.motion.sample_motion` with a learnt model.
+        Detection, search and confirmation.
     rng : numpy.random.Generator
-        Source of randomness.
+        Random generator.
     is_start_known : bool
-        False: the start is no more than the middle of the ``far_m`` within which the car is, its heading unknown.
+        False: the start is only the centre of the ``far_reach_m`` in which the vehicle is, its heading unknown.
     grid : MapGrid, optional
-        `rol.mcl.build_grid` of the map and the settings, if it is at hand.
-
-    Yields
-    ------
-    result : RecoveryUpdate
-        One per scan.
-
-    Raises
-    ------
-    rol.mcl.MclError
-        If there are fewer steps than clouds ask for, or an input is no cloud, no pose or no map.
+        ``settings.measurement.build_grid(map_points)``, if it is available.
     """
-    from rol.mcl import MclError, build_grid, sample_particles, update
 
-    grid = build_grid(map_points, settings) if grid is None else grid
-    spreads = settings.start_spread_m, settings.start_spread_yaw_rad
-    particles = sample_particles(start, settings.n_particles, *spreads, rng)
-    state, steps = _begin(particles, recovery, is_start_known), iter(steps)
-    calm = replace(settings, exponent=recovery.still_share * settings.exponent)
-    for index, points in enumerate(clouds):
-        step = np.zeros(3) if index == 0 else next(steps, None)
-        if step is None:
-            raise MclError(f"no odometry step to scan {index}: one fewer than clouds are needed")
-        length = _move_all(state, step, move, rng) if index > 0 else np.inf
-        used = settings if length > recovery.still_m else calm
-        result = update(index, state.particles, state.weights, points, grid, used, rng)
-        told, winner = _watch(state, result, points, grid, used, recovery, rng)
-        yield told
-        state.particles, state.weights = result.next_particles, result.next_weights
+    def __init__(
+        self,
+        map_points: np.ndarray,
+        start: np.ndarray,
+        settings: MclSettings,
+        recovery: RecoverySettings,
+        rng: np.random.Generator,
+        is_start_known: bool = True,
+        grid: MapGrid | None = None,
+    ) -> None:
+        self.map_points, self.settings, self.recovery, self.rng = map_points, settings, recovery, rng
+        self.grid = settings.measurement.build_grid(map_points) if grid is None else grid
+        self.coarse_grid: MapGrid | None = None
+        exponent = recovery.stationary_weight * settings.measurement.exponent
+        self.stationary = replace(settings, measurement=replace(settings.measurement, exponent=exponent))
+        self.reset(start)
+        self.is_far = not is_start_known
+
+    def reset(self, pose: np.ndarray) -> None:
+        """Start again at a pose [m, m, rad]."""
+        n, settings, recovery = self.settings.n_particles, self.settings, self.recovery
+        spreads = settings.start_spread_m, settings.start_spread_yaw_rad
+        self.particles = sample_particles(pose, n, *spreads, self.rng)
+        self.weights = np.full(n, 1.0 / n)
+        self.hypotheses = no_hypotheses(recovery.confirmation)
+        n_clouds = recovery.relocalization.n_clouds
+        self.clouds, self.increments = deque(maxlen=n_clouds), deque(maxlen=n_clouds - 1)
+        self.scores = deque(maxlen=max(recovery.detection.n_scans, recovery.confirmation.n_scans))
+        self.is_far, self.is_trusted, self.n_lost = False, False, 0
+        # Scans since the last search; distances since the last search, the last scan that counted, a low score.
+        self.since_search, self.searched_m, self.moved_m, self.high_score_m = 10**6, 1e9, 0.0, 0.0
+
+    def step(self, points: np.ndarray, increment: np.ndarray | None = None) -> RecoveryUpdate:
+        """Process one scan.
+
+        Parameters
+        ----------
+        points : array, shape (m, 2)
+            Points of the scan in the radar frame [m].
+        increment : array-like, shape (3,), optional
+            Pose of this scan in the last one [m, m, rad]; none for the first scan.
+
+        Returns
+        -------
+        result : RecoveryUpdate
+        """
+        length = np.inf if increment is None else self._predict(increment)
+        settings = self.settings if length > self.recovery.stationary_m else self.stationary
+        result = update(self.particles, self.weights, points, self.grid, settings, self.rng)
+        contrast = self._observe(result, points, settings.measurement.exponent)
+        winner = self._find_winner()
+        assessed = self._assess(result, contrast, winner)
+        self.particles, self.weights = result.next_particles, result.next_weights
         if winner is not None:
-            _enthrone(state, winner, settings, rng)
-        elif told.health < recovery.doubt or state.is_far:
-            _search(state, result.pose, map_points, grid, recovery, rng)
+            self._promote(winner)
+        elif self.is_far or assessed.normalized_score < self.recovery.detection.search_below:
+            self._search(result.pose)
         else:
-            state.rivals = state.rivals.keep(state.rivals.ages < recovery.trial)
+            is_young = self.hypotheses.ages < self.recovery.confirmation.n_scans
+            self.hypotheses = self.hypotheses.keep(is_young)
+        return assessed
+
+    def _predict(self, increment: np.ndarray) -> float:
+        """Move all particles, record the motion, and return its length [m]."""
+        motion = self.settings.motion
+        self.particles = predict(self.particles, increment, motion, self.rng)
+        self.increments.append(mean_increment(increment, motion))
+        length = float(np.hypot(*self.increments[-1][:2]))
+        self.moved_m += length
+        self.high_score_m += length
+        self.searched_m += length
+        self.hypotheses = self.hypotheses.predict(increment, motion, self.rng)
+        return length
+
+    def _observe(self, result: MclUpdate, points: np.ndarray, exponent: float) -> float:
+        """Record the scan and the score contrasts of the estimate and of the hypotheses."""
+        max_range_m = self.recovery.relocalization.max_range_m
+        self.clouds.append(points[np.hypot(points[:, 0], points[:, 1]) < max_range_m])
+        contrast = float(score_contrast(result.pose[None], points, self.grid)[0])
+        self.hypotheses, contrasts = self.hypotheses.update(points, self.grid, exponent, self.rng)
+        self.since_search += 1
+        if not self.is_trusted or self.moved_m >= self.recovery.detection.moved_m:
+            self._record(contrast, contrasts)
+        self.hypotheses = self.hypotheses.without_duplicates(result.pose)
+        return contrast
+
+    def _record(self, contrast: float, of_hypotheses: np.ndarray) -> None:
+        """Let a scan count for or against the estimate and the hypotheses."""
+        detection, self.moved_m = self.recovery.detection, 0.0
+        self.scores.append(contrast)
+        self.hypotheses = self.hypotheses.record(of_hypotheses)
+        score = self.normalized_score
+        if len(self.scores) < detection.n_scans or score < detection.search_below:
+            self.high_score_m = 0.0
+        self.is_trusted = self.is_trusted or self.high_score_m > detection.trust_m
+        self.n_lost = self.n_lost + 1 if score < detection.lost_below else 0
+        is_lost_for_long = self.n_lost > self.recovery.relocalization.far_after
+        self.is_far = (self.is_far and not self.is_trusted) or is_lost_for_long
+
+    @property
+    def normalized_score(self) -> float:
+        """Mean score contrast of the last scans that counted, divided by the reference contrast."""
+        last = list(self.scores)[-self.recovery.detection.n_scans :]
+        return float(np.mean(last)) / self.recovery.reference_contrast
+
+    def _assess(self, result: MclUpdate, contrast: float, winner: int | None) -> RecoveryUpdate:
+        """Assess the estimate."""
+        is_low = self.normalized_score < self.recovery.detection.lost_below
+        return RecoveryUpdate(
+            filter=result,
+            score_contrast=contrast,
+            normalized_score=self.normalized_score,
+            is_lost=self.is_far or is_low or self._find_leader() is not None,
+            n_hypotheses=len(self.hypotheses),
+            n_particles=len(result.particles) + self.hypotheses.weights.size,
+            was_replaced=winner is not None,
+        )
+
+    def _leads(self) -> np.ndarray:
+        """Compute by how much each hypothesis matches better than the estimate, on average, shape (h,)."""
+        n_scans = self.hypotheses.scores.shape[1]
+        own = np.array(self.scores)[-n_scans:]
+        gaps = self.hypotheses.scores - np.concatenate([np.full(n_scans - len(own), np.nan), own])
+        return np.nansum(gaps, axis=1) / np.maximum(np.isfinite(gaps).sum(axis=1), 1)
+
+    def _find_leader(self) -> int | None:
+        """Find the best hypothesis followed for a third of the scans that beats the estimate, if any."""
+        if not len(self.hypotheses):
+            return None
+        leads = self._leads()
+        leads[self.hypotheses.ages < self.recovery.confirmation.n_scans // 3] = -np.inf
+        best = int(np.argmax(leads))
+        return best if leads[best] > 0.0 else None
+
+    def _find_winner(self) -> int | None:
+        """Find the hypothesis that replaces the estimate, if any: confirmed, better, unique, and with a high score."""
+        limits, leader = self.recovery.confirmation, self._find_leader()
+        if leader is None or self.hypotheses.ages[leader] < limits.n_scans:
+            return None
+        means, reference = self.hypotheses.means, self.recovery.reference_contrast
+        confirmed = np.flatnonzero(self.hypotheses.ages >= limits.n_scans)
+        order = confirmed[np.argsort(-means[confirmed], kind="stable")]
+        best, others = int(order[0]), means[order[1:]]
+        margin = limits.trusted_margin if self.is_trusted else limits.margin
+        uniqueness = limits.far_uniqueness if self.is_far else limits.uniqueness
+        is_better = self._leads()[best] > margin * reference
+        is_unique = len(others) == 0 or means[best] - others[0] > uniqueness * reference
+        is_high = means[best] > self.recovery.detection.lost_below * reference
+        return best if is_better and is_unique and is_high else None
+
+    def _promote(self, winner: int) -> None:
+        """Replace the filter's particles and scores by those of a hypothesis."""
+        particles, weights = self.hypotheses.particles[winner], self.hypotheses.weights[winner]
+        n = max(self.settings.resampling.min_particles, len(particles))
+        chosen = self.rng.choice(len(particles), n, p=weights)
+        self.particles, self.weights = particles[chosen], np.full(n, 1.0 / n)
+        self.scores.extend(self.hypotheses.scores[winner].tolist())
+        self.hypotheses = no_hypotheses(self.recovery.confirmation)
+        self.is_far, self.is_trusted, self.n_lost, self.high_score_m = False, False, 0, 0.0
+
+    def _is_search_due(self) -> bool:
+        """Check the pause since the last search, the number of scans, and the distance before a far search."""
+        settings, detection = self.recovery.relocalization, self.recovery.detection
+        pause = settings.trusted_pause if self.is_trusted else settings.pause
+        pause = settings.far_pause if self.is_far else pause
+        if self.since_search < pause or len(self.clouds) < detection.n_scans:
+            return False
+        return not self.is_far or self.searched_m >= detection.moved_m * detection.n_scans
+
+    def _search(self, pose: np.ndarray) -> None:
+        """Search for hypotheses if a search is due, and follow the new ones beside the best of the old."""
+        if not self._is_search_due():
+            return
+        self.since_search, self.searched_m = 0, 0.0
+        clouds, increments = self._last_clouds()
+        clouds = remove_ego_static_points(clouds, increments)
+        points = first_of_cells(merge_clouds(clouds, increments), self.grid.cell)
+        settings, confirmation = self.recovery.relocalization, self.recovery.confirmation
+        if self.is_far:
+            n, coarse = confirmation.n_far_hypotheses, self._build_coarse_grid()
+            window = {"reach_m": settings.far_reach_m, "yaw_step": np.deg2rad(2.0), "n_refined": 9000}
+        else:
+            n, coarse = confirmation.n_hypotheses, self.grid
+            window = {"reach_m": settings.reach_m, "reach_yaw": settings.reach_yaw}
+        window = SearchSettings(**window, n_best=n, workers=settings.workers)
+        found, _ = search_poses(points, coarse, self.grid, pose, window)
+        self.hypotheses = self.hypotheses.add(found, pose, n, self.rng)
+
+    def _build_coarse_grid(self) -> MapGrid:
+        """Build, once, the likelihood field of the far search: a wide Gaussian on wide cells."""
+        if self.coarse_grid is None:
+            self.coarse_grid = build_likelihood_field(self.map_points, 0.45, 1.0)
+        return self.coarse_grid
+
+    def _last_clouds(self) -> tuple[list[np.ndarray], list[np.ndarray]]:
+        """Give the scans of the last metres, two seconds at least, and the increments between them."""
+        increments = list(self.increments)[-(len(self.clouds) - 1) :]
+        driven = np.cumsum([np.hypot(step[0], step[1]) for step in increments[::-1]])
+        length_m = self.recovery.relocalization.length_m
+        n = max(int(np.searchsorted(driven, length_m)) + 1, self.recovery.detection.n_scans)
+        is_cut = n <= len(increments)
+        return list(self.clouds)[-n:], increments[len(increments) - n + 1 :] if is_cut else increments
 
 
-def _move_all(state: _State, step: np.ndarray, move: Move, rng: np.random.Generator) -> float:
-    """Move the filter's particles and those of its rivals, note how far the car went, and give it [m]."""
-    state.particles = move(state.particles, step, rng)
-    state.steps.append(move_mean(step, move))
-    length = float(np.hypot(*state.steps[-1][:2]))
-    state.moved_m += length
-    state.well_m += length
-    state.searched_m += length
-    state.rivals = _move_rivals(state.rivals, step, move, rng)
-    return length
-
-
-def _watch(
-    state: _State,
-    result: MclUpdate,
-    points: np.ndarray,
-    grid: MapGrid,
-    settings: MclSettings,
-    recovery: RecoverySettings,
-    rng: np.random.Generator,
-) -> tuple[RecoveryUpdate, int | None]:
-    """Hold the estimate against chance and against its rivals; say what to think of it, and which rival takes over."""
-    from rol_beyond.search import measure_excess
-
-    state.clouds.append(points[np.hypot(points[:, 0], points[:, 1]) < recovery.max_range_m])
-    excess = float(measure_excess(result.pose[None], points, grid)[0])
-    state.rivals, of_rivals = _weigh_rivals(state.rivals, points, grid, settings.exponent, rng)
-    _note_excess(state, excess, of_rivals, recovery)
-    state.rivals = _merge_rivals(state.rivals, result.pose)
-    health = _health(state, recovery)
-    state.is_far = (state.is_far and not state.is_trusted) or state.n_lost > recovery.far_after
-    is_lost = state.is_far or health < recovery.lost or _best_rival(state, recovery) is not None
-    winner, n_rivals = _decide(state, recovery), len(state.rivals)
-    n_particles = len(result.particles) + state.rivals.weights.size
-    covariance = covariance_of(result)
-    told = RecoveryUpdate(
-        result, covariance, excess, health, is_lost, n_rivals, n_particles, winner is not None
-    )
-    return told, winner
-
-
-def move_mean(step: np.ndarray, move: Move) -> np.ndarray:
-    """Give the mean motion of particles for a step of the odometry: that of many drawn with a fixed seed."""
-    moved = move(np.zeros((256, 3)), step, np.random.default_rng(0))
-    return np.median(moved, axis=0)
-
-
-def covariance_of(result: MclUpdate) -> np.ndarray:
-    """Give the covariance of an estimate: that of the weighted particles about it.
+def mean_increment(increment: np.ndarray, motion: MotionModel) -> np.ndarray:
+    """Compute the median of 256 sampled increments, with a fixed seed.
 
     Parameters
     ----------
-    result : MclUpdate
-        From `rol.mcl.update`.
+    increment : array, shape (3,)
+        Odometry [m, m, rad].
+    motion : MotionModel
+        Its distribution.
 
     Returns
     -------
-    covariance : array, shape (3, 3)
-        Of (x, y, yaw) in the map frame [m, rad]; a centimetre and 0.05 deg at least, for particles may be all the same.
+    increment : array, shape (3,)
+        Typical increment [m, m, rad].
+
+    Notes
+    -----
+    ``motion.mean`` is exact. It differs from this by 12 mm and 5 mm (RMS, forward and left) and changes the RMSE over 1,500
+    scans of the real route by up to 1.4 mm, so the reference results would have to be renewed.
     """
-    away = result.particles - result.pose
-    away[:, 2] = wrap_angle(away[:, 2])
-    return (away * result.weights[:, None]).T @ away + np.diag([1e-4, 1e-4, np.deg2rad(0.05) ** 2])
-
-
-def _begin(particles: np.ndarray, recovery: RecoverySettings, is_start_known: bool) -> _State:
-    n, k, t = len(particles), recovery.rival_particles, recovery.trial
-    none = Rivals(np.zeros((0, k, 3)), np.zeros((0, k)), np.zeros((0, t)))
-    window = deque(maxlen=recovery.window)
-    return _State(
-        particles, np.full(n, 1.0 / n), none, window, deque(maxlen=recovery.window - 1),
-        deque(maxlen=max(recovery.scans, t)), is_far=not is_start_known,
-    )  # fmt: skip
-
-
-def _move_rivals(rivals: Rivals, step: np.ndarray, move: Move, rng: np.random.Generator) -> Rivals:
-    """Move all particles of all rivals."""
-    if not len(rivals):
-        return rivals
-    moved = move(rivals.particles.reshape(-1, 3), step, rng)
-    return Rivals(moved.reshape(rivals.particles.shape), rivals.weights, rivals.scores)
-
-
-def _weigh_rivals(
-    rivals: Rivals, points: np.ndarray, grid: MapGrid, exponent: float, rng: np.random.Generator
-) -> tuple[Rivals, np.ndarray]:
-    """Weigh each rival's particles among themselves, resample where few hold all weight; give their excess, too."""
-    from rol.mcl import count_matches, normalize_weights, resample_systematic, weigh
-    from rol_beyond.search import measure_excess
-
-    if not len(rivals) or not len(points):
-        return rivals, np.zeros(len(rivals))
-    h, k, _ = rivals.particles.shape
-    sums = count_matches(rivals.particles.reshape(-1, 3), points, grid.values, grid.origin, grid.cell)
-    logs = weigh(sums.reshape(h, k), exponent)
-    weights = np.array([normalize_weights(*row)[0] for row in zip(logs, rivals.weights, strict=True)])
-    weighed = Rivals(rivals.particles.copy(), weights, rivals.scores)
-    excess = measure_excess(weighed.poses, points, grid)
-    for i in np.flatnonzero(1.0 / np.sum(weights**2, axis=1) < 0.5 * k):
-        weighed.particles[i] = weighed.particles[i, resample_systematic(weights[i], rng)]
-        weights[i] = 1.0 / k
-    return weighed, excess
-
-
-def _note_excess(state: _State, own: float, of_rivals: np.ndarray, recovery: RecoverySettings) -> None:
-    """Count a scan for and against the estimate and its rivals, unless it is trusted and the car has hardly moved."""
-    state.since_search += 1
-    if state.is_trusted and state.moved_m < recovery.moved_m:
-        return
-    state.moved_m = 0.0
-    state.scores.append(own)
-    scores = np.column_stack([state.rivals.scores[:, 1:], of_rivals])
-    state.rivals = Rivals(state.rivals.particles, state.rivals.weights, scores)
-    health = _health(state, recovery)
-    if len(state.scores) < recovery.scans or health < recovery.doubt:
-        state.well_m = 0.0
-    state.is_trusted = state.is_trusted or state.well_m > recovery.trust_m
-    state.n_lost = state.n_lost + 1 if health < recovery.lost else 0
-
-
-def _health(state: _State, recovery: RecoverySettings) -> float:
-    """Mean excess of the last scans that counted, as a share of the level."""
-    return float(np.mean(list(state.scores)[-recovery.scans :])) / recovery.level
-
-
-def _merge_rivals(rivals: Rivals, pose: np.ndarray) -> Rivals:
-    """Drop rivals that have come to where the estimate or a better rival is."""
-    from rol_beyond.search import keep_apart
-
-    if not len(rivals):
-        return rivals
-    known, worth = np.vstack([pose[None], rivals.poses]), np.append(np.inf, rivals.means)
-    kept = keep_apart(known, np.argsort(-worth, kind="stable"), len(known), (1.0, np.deg2rad(3.0)))
-    return rivals.keep(np.array(sorted(kept)[1:], dtype=int) - 1)
-
-
-def _best_rival(state: _State, recovery: RecoverySettings) -> int | None:
-    """Number of the best rival that has been followed for a third of a trial and fits better than the estimate."""
-    if not len(state.rivals):
-        return None
-    lead = _leads(state)
-    lead[state.rivals.ages < recovery.trial // 3] = -np.inf
-    best = int(np.argmax(lead))
-    return best if lead[best] > 0.0 else None
-
-
-def _leads(state: _State) -> np.ndarray:
-    """By how much each rival fits better than the estimate, on average over the scans that it was followed."""
-    own = np.array(state.scores)[-state.rivals.scores.shape[1] :]
-    own = np.concatenate([np.full(state.rivals.scores.shape[1] - len(own), np.nan), own])
-    gaps = state.rivals.scores - own
-    return np.nansum(gaps, axis=1) / np.maximum(np.isfinite(gaps).sum(axis=1), 1)
-
-
-def _decide(state: _State, recovery: RecoverySettings) -> int | None:
-    """Number of the rival that takes over, if any: followed long enough, plainly better, and itself in good health."""
-    best = _best_rival(state, recovery)
-    if best is None or state.rivals.ages[best] < recovery.trial:
-        return None
-    means, lead = state.rivals.means, _leads(state)
-    ripe = np.flatnonzero(state.rivals.ages >= recovery.trial)
-    order = ripe[np.argsort(-means[ripe], kind="stable")]
-    best, others = int(order[0]), means[order[1:]]
-    margin = recovery.trusted_margin if state.is_trusted else recovery.margin
-    unique = recovery.far_unique if state.is_far else recovery.unique
-    is_better = lead[best] > margin * recovery.level
-    is_unique = len(others) == 0 or means[best] - others[0] > unique * recovery.level
-    return best if is_better and is_unique and means[best] > recovery.lost * recovery.level else None
-
-
-def _enthrone(state: _State, winner: int, settings: MclSettings, rng: np.random.Generator) -> None:
-    """Let a rival's particles be the filter's, and its scores too."""
-    n = max(settings.min_particles, state.rivals.particles.shape[1])
-    chosen = rng.choice(state.rivals.particles.shape[1], n, p=state.rivals.weights[winner])
-    state.particles, state.weights = state.rivals.particles[winner, chosen], np.full(n, 1.0 / n)
-    state.scores.extend(state.rivals.scores[winner].tolist())
-    state.rivals = state.rivals.keep(np.zeros(len(state.rivals), dtype=bool))
-    state.is_far, state.is_trusted, state.n_lost, state.well_m = False, False, 0, 0.0
-
-
-def _search(
-    state: _State,
-    pose: np.ndarray,
-    map_points: np.ndarray,
-    grid: MapGrid,
-    recovery: RecoverySettings,
-    rng: np.random.Generator,
-) -> None:
-    """Search for rivals, if it is time, and follow the new ones beside the best of the old."""
-    from rol.mcl import build_distance_grid
-    from rol_beyond.search import drop_riders, join_clouds, search_poses
-
-    pause = recovery.trusted_pause if state.is_trusted else recovery.pause
-    pause = recovery.far_pause if state.is_far else pause
-    if state.since_search < pause or len(state.clouds) < recovery.scans:
-        return
-    if state.is_far and state.searched_m < recovery.moved_m * recovery.scans:
-        return
-    state.since_search, state.searched_m = 0, 0.0
-    clouds, steps = _last_stretch(state, recovery)
-    points = first_of_cells(join_clouds(drop_riders(clouds, steps), steps), grid.cell)
-    n = recovery.n_far_rivals if state.is_far else recovery.n_rivals
-    if state.is_far:
-        how = {"reach_m": recovery.far_m, "yaw_step": np.deg2rad(2.0), "n_looked_at": 9000, "n_best": n}
-        if state.coarse is None:
-            state.coarse = build_distance_grid(map_points, 0.45, 1.0)  # a wide Gaussian for wide cells
-        found, _ = search_poses(points, state.coarse, grid, pose, workers=recovery.workers, **how)
-    else:
-        how = {"reach_m": recovery.reach_m, "reach_yaw": recovery.reach_yaw, "n_best": n}
-        found, _ = search_poses(points, grid, grid, pose, workers=recovery.workers, **how)
-    state.rivals = _add_rivals(state.rivals, found, pose, n, recovery, rng)
-
-
-def _last_stretch(state: _State, recovery: RecoverySettings) -> tuple[list[np.ndarray], list[np.ndarray]]:
-    """Clouds of the last metres, two seconds at least, and the steps between them."""
-    steps = list(state.steps)[-(len(state.clouds) - 1) :]
-    way = np.cumsum([np.hypot(step[0], step[1]) for step in steps[::-1]])
-    n = max(int(np.searchsorted(way, recovery.window_m)) + 1, recovery.scans)
-    return list(state.clouds)[-n:], steps[len(steps) - n + 1 :] if n <= len(steps) else steps
-
-
-def _add_rivals(
-    rivals: Rivals,
-    found: np.ndarray,
-    pose: np.ndarray,
-    n: int,
-    recovery: RecoverySettings,
-    rng: np.random.Generator,
-) -> Rivals:
-    """Add poses that are neither the estimate nor a rival already, and drop the worst of those that had their trial."""
-    known = np.vstack([pose[None], rivals.poses])
-    away = np.abs(found[:, None] - known[None])
-    away[..., 2] = np.abs(wrap_angle(away[..., 2]))
-    is_new = ~((away[..., :2] < 1.5).all(axis=-1) & (away[..., 2] < np.deg2rad(4.0))).any(axis=1)
-    fresh = check_poses(found[is_new], "found poses")
-    k, t = recovery.rival_particles, recovery.trial
-    particles = fresh[:, None] + rng.standard_normal((len(fresh), k, 3)) * (0.3, 0.3, np.deg2rad(0.7))
-    added = Rivals(particles, np.full((len(fresh), k), 1.0 / k), np.full((len(fresh), t), np.nan))
-    order = np.argsort(-rivals.means, kind="stable")
-    old = rivals.keep(order[: max(n // 2, n - len(fresh))])
-    return Rivals(*(np.concatenate([getattr(old, name), getattr(added, name)[: n - len(old)]])
-                    for name in ("particles", "weights", "scores")))  # fmt: skip
+    return np.median(predict(np.zeros((256, 3)), increment, motion, np.random.default_rng(0)), axis=0)

@@ -32,11 +32,11 @@ CHOICES: dict[str, tuple[Any, ...]] = {  # parameter -> all its values
     "bf16": ("auto", True, False),
     "device": ("cpu", "cuda"),
     "measurement": ("statistical", "rendered"),
-    "method": ("paper", "rol"),
+    "method": ("paper", "robust"),
     "motion": ("none", "corrected"),
     "points_source": ("raw", "fake", "real", "fake-corrected"),
 }
-MAY_BE_ZERO = ("seed", "twin_seed", "scan_number", "rendered_first", "gap_scans", "steps", "blocks")
+MAY_BE_ZERO = ("seed", "twin_seed", "scan_number", "rendered_first", "gap_scans", "steps", "n_blocks")
 NETWORKS = {
     "network": "safetensors",
     "compared": "safetensors",

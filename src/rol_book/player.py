@@ -15,6 +15,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from string import Template
 
+import cv2
 import numpy as np
 
 from rol.geometry import first_of_cells
@@ -186,8 +187,6 @@ def play_images(
 
 def _encode(image: np.ndarray, colour: str | None, size: int, quality: int) -> str:
     """Write an image as an address that holds it: JPEG of its greys, dark on white, or PNG in one colour."""
-    import cv2
-
     image = np.asarray(image)
     if image.ndim != 2 or image.dtype != np.uint8:
         raise ValueError(
@@ -211,8 +210,13 @@ def _page(data: dict, words: str, width: int, height: int, draw: str) -> str:
     text = json.dumps(data, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
     return _PAGE.substitute(
         name="player-" + hashlib.sha256(text.encode()).hexdigest()[:10],
-        words=html.escape(words), width=width, height=height, last=len(data["frames"]) - 1, data=text, draw=draw,
-    )  # fmt: skip
+        words=html.escape(words),
+        width=width,
+        height=height,
+        last=len(data["frames"]) - 1,
+        data=text,
+        draw=draw,
+    )
 
 
 def _thin(points: np.ndarray, most: int) -> np.ndarray:

@@ -6,6 +6,7 @@ import argparse
 import sys
 
 from rol_sim.session.settings import load_settings
+from rol_sim.session.writer import write_session
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -33,7 +34,6 @@ def main(arguments: list[str] | None = None) -> int:
     given = parser.parse_args(arguments)
     try:
         settings = load_settings(given.config)
-        from rol_sim.session.writer import write_session
 
         for name in given.session or settings.sessions:
             write_session(

@@ -9,10 +9,13 @@ from __future__ import annotations
 
 from itertools import pairwise
 
+import cv2
 import numpy as np
+from scipy.spatial import cKDTree
 
-from rol.geometry import relative_pose
-from rol.radar import MEASURED
+from rol.geometry import relative_pose, transform_points
+from rol.radar import MEASURED, ScanMotion, k_strongest_peaks, polar_to_cartesian
+from rol_sim.sensors.radar import beam_azimuths
 
 BRIGHTNESS_CODES = (40, 60, 80, 100, 120)
 ZERO_RANGES_M = (3.0, 28.0, 41.0, 80.0, 106.0, 145.0)
@@ -35,7 +38,9 @@ def forbidden_codes() -> np.ndarray:
     return np.setdiff1d(np.arange(24), reachable).astype(np.uint8)
 
 
-def brightness_shares(codes: np.ndarray, codes_from: tuple[int, ...] = BRIGHTNESS_CODES) -> dict[int, float]:
+def brightness_fractions(
+    codes: np.ndarray, codes_from: tuple[int, ...] = BRIGHTNESS_CODES
+) -> dict[int, float]:
     """Give the share of pixels at or above each code.
 
     Parameters
@@ -88,7 +93,9 @@ def hellinger_distance(p: np.ndarray, q: np.ndarray) -> float:
     return float(np.sqrt(max(0.0, 1.0 - np.sum(np.sqrt(np.asarray(p) * np.asarray(q))))))
 
 
-def zero_shares(codes: np.ndarray, ranges_m: tuple[float, ...] = ZERO_RANGES_M, half_bins: int = 15) -> dict:
+def zero_fractions(
+    codes: np.ndarray, ranges_m: tuple[float, ...] = ZERO_RANGES_M, half_bins: int = 15
+) -> dict:
     """Give the share of code 0 in quiet bins at several ranges.
 
     Parameters
@@ -292,21 +299,20 @@ def _mean_correlation(
     codes: np.ndarray, ways: np.ndarray, lag: int, twists: np.ndarray | None, doppler_seconds: float
 ) -> float:
     """Mean correlation of scans i and i + lag, as images of 0.25 m per pixel laid on each other."""
-    import cv2
-
-    from rol.radar import ScanMotion, polar_to_cartesian
-    from rol_sim.sensors.radar import beam_azimuths
-
     azimuths = beam_azimuths()
     width, pixel, found = 512, 0.25, []
     middle = (width - 1) / 2.0
     images = [
         polar_to_cartesian(
-            scan, azimuths, calibration=MEASURED, pixel_size=pixel, width=width,
+            scan,
+            azimuths,
+            calibration=MEASURED,
+            pixel_size=pixel,
+            width=width,
             motion=None if twists is None else ScanMotion(twists[i], doppler_seconds=doppler_seconds),
         )
         for i, scan in enumerate(codes)
-    ]  # fmt: skip
+    ]
     away = np.hypot(*(np.mgrid[:width, :width] - middle)) * pixel
     own = np.where((away > 4.0) & (away < 50.0), np.float32(0.0), np.float32(np.nan))  # no leakage
     for before, after, (x, y, yaw) in zip(images[:-lag], images[lag:], ways, strict=True):
@@ -331,11 +337,11 @@ def scan_statistics(codes: np.ndarray) -> dict:
     Returns
     -------
     statistics : dict
-        "histogram": share of every code; "shares": code -> share of pixels at or above it; "zero_shares": range [m] -> share of code 0 in quiet
+        "histogram": share of every code; "shares": code -> share of pixels at or above it; "zero_fractions": range [m] -> share of code 0 in quiet
         bins; "range_correlation": of the noise at lags 1-7 bins; "azimuth_correlation"; "near_field": range
         [m] -> mean code; "near_copies": True when bins 0-4 are identical; "floors": class of peak -> far
         floor; "point_spread": levels [dB] by distance; "forbidden": number of pixels with a code that cannot
-        be; "greatest": greatest code; "shares_40_by_range": share of codes >= 40 by range, edges [m] as keys.
+        be; "greatest": greatest code; "fractions_40_by_range": share of codes >= 40 by range, edges [m] as keys.
 
     Raises
     ------
@@ -348,9 +354,9 @@ def scan_statistics(codes: np.ndarray) -> dict:
     near = _rows(codes)[:, :5]
     return {
         "histogram": code_histogram(codes),
-        "shares": brightness_shares(codes),
-        "shares_40_by_range": shares_by_range(codes, 40),
-        "zero_shares": zero_shares(codes),
+        "shares": brightness_fractions(codes),
+        "fractions_40_by_range": fractions_by_range(codes, 40),
+        "zero_fractions": zero_fractions(codes),
         "range_correlation": noise_correlation(codes),
         "azimuth_correlation": azimuth_correlation(codes),
         "near_field": near_field(codes),
@@ -362,7 +368,7 @@ def scan_statistics(codes: np.ndarray) -> dict:
     }
 
 
-def shares_by_range(
+def fractions_by_range(
     codes: np.ndarray, code: int, edges_m: tuple[float, ...] = (2.5, 5, 10, 20, 30, 50, 80, 110, 165)
 ) -> dict:
     """Give the share of pixels at or above a code, ring by ring.
@@ -387,7 +393,7 @@ def shares_by_range(
     return dict(zip(names, shares, strict=True))
 
 
-def map_shares(
+def map_fractions(
     codes: np.ndarray,
     poses: np.ndarray,
     map_points: np.ndarray,
@@ -418,17 +424,16 @@ def map_shares(
     shares : array, shape (n, len(within_m))
         Share of the peaks of each scan; NaN for a scan without peaks.
     """
-    from scipy.spatial import cKDTree
-
-    from rol.geometry import transform_points
-    from rol.radar import k_strongest_peaks
-    from rol_sim.sensors.radar import beam_azimuths
-
     tree, shares = cKDTree(map_points), []
     for scan, pose in zip(codes, poses, strict=True):
         peaks = k_strongest_peaks(
-            scan, beam_azimuths(), k, min_code, range_limits_m=(2.5, max_range_m), calibration=MEASURED,
-        )  # fmt: skip
+            scan,
+            beam_azimuths(),
+            k,
+            min_code,
+            range_limits_m=(2.5, max_range_m),
+            calibration=MEASURED,
+        )
         gaps = tree.query(transform_points(pose, peaks))[0]
         shares.append([float(np.mean(gaps < limit)) if len(gaps) else float("nan") for limit in within_m])
     return np.array(shares)

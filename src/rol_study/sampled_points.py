@@ -19,7 +19,6 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from numba import prange
 from scipy.spatial import cKDTree
 
 from rol.compiled import compiled
@@ -28,7 +27,7 @@ from rol.geometry import check_fields, check_grid, check_poses, invert, transfor
 KINDS = ("near", "beside", "false")
 
 
-class MapPointsError(ValueError):
+class SampledPointsError(ValueError):
     """Raised for a map or poses from which no points can be drawn, and for a quality that cannot be had."""
 
 
@@ -53,7 +52,7 @@ class FrontEnd:
 
     Raises
     ------
-    MapPointsError
+    SampledPointsError
         If a value is out of its range; the message names it.
     """
 
@@ -73,11 +72,11 @@ class FrontEnd:
             "[1, inf)": "life_scans",
             "(0, inf)": "max_range_m",
         }
-        check_fields(self, allowed, MapPointsError)
+        check_fields(self, allowed, SampledPointsError)
 
 
 @dataclass(frozen=True)
-class Sight:
+class VisiblePoints:
     """What can be seen of a map from many poses.
 
     Attributes
@@ -99,7 +98,7 @@ class Sight:
         return self.points[self.starts[index] : self.starts[index + 1]] * 0.01
 
 
-def look_around(
+def find_visible_points(
     map_points: np.ndarray,
     poses: np.ndarray,
     *,
@@ -108,7 +107,7 @@ def look_around(
     n_beams: int = 400,
     n_surfaces: int = 2,
     depth_m: float = 1.0,
-) -> Sight:
+) -> VisiblePoints:
     """Find the cells of a map that beams from each pose reach before something stands in their way.
 
     Parameters
@@ -130,34 +129,30 @@ def look_around(
 
     Returns
     -------
-    sight : Sight
+    sight : VisiblePoints
         Middles of the cells seen, each once per pose.
 
     Raises
     ------
-    MapPointsError
+    SampledPointsError
         If the map is empty, not finite or too large for a grid.
     """
     map_points, poses = np.asarray(map_points, dtype=np.float64), check_poses(poses)
     if len(map_points) == 0:
-        raise MapPointsError("the map holds no point")
+        raise SampledPointsError("the map holds no point")
     if not np.isfinite(map_points).all():
-        raise MapPointsError("the map holds a point that is not finite")
+        raise SampledPointsError("the map holds a point that is not finite")
     corner = map_points.min(axis=0) - 0.5 * cell
     shape = np.floor((map_points.max(axis=0) - corner) / cell) + 1
-    shape = check_grid(shape, map_points, "map", error=MapPointsError)
+    shape = check_grid(shape, map_points, "map", error=SampledPointsError)
     cells = np.floor((map_points - corner) / cell).astype(np.int64)
     occupied = np.zeros(shape, dtype=np.uint8)
     occupied[cells[:, 0], cells[:, 1]] = 1
     places = np.column_stack([(poses[:, :2] - corner) / cell, poses[:, 2]])
     reach, depth = max_range_m / cell, depth_m / cell
-    seen = [
-        _cast_all(occupied, part, n_beams, reach, n_surfaces, depth)
-        for part in np.array_split(places, max(len(places) // 500, 1))
-    ]
-    points = np.concatenate([np.concatenate(part) for part in seen]) * cell * 100.0
-    counts = [len(one) for part in seen for one in part]
-    return Sight(np.rint(points).astype(np.int16), np.cumsum([0, *counts]))
+    seen = [_cast(occupied, u, v, yaw, n_beams, reach, n_surfaces, depth) for u, v, yaw in places]
+    points = [np.rint(points * cell * 100.0).astype(np.int16) for points in seen]
+    return VisiblePoints(np.concatenate(points), np.cumsum([0, *map(len, points)]))
 
 
 @compiled
@@ -193,17 +188,7 @@ def _cast(occupied, u0, v0, yaw, n_beams, reach, n_surfaces, depth):
     return points
 
 
-@compiled(parallel=True)
-def _cast_all(occupied, places, n_beams, reach, n_surfaces, depth):
-    """Do this from many places."""
-    seen = [np.empty((0, 2))] * len(places)
-    for k in prange(len(places)):
-        u, v, yaw = places[k]
-        seen[k] = _cast(occupied, u, v, yaw, n_beams, reach, n_surfaces, depth)
-    return seen
-
-
-def mix_kinds(shares: np.ndarray, share_1m: float, share_2m: float) -> np.ndarray:
+def solve_mixture(shares: np.ndarray, share_1m: float, share_2m: float) -> np.ndarray:
     """Find how to mix the three kinds of points so that two shares come out.
 
     Parameters
@@ -220,22 +205,22 @@ def mix_kinds(shares: np.ndarray, share_1m: float, share_2m: float) -> np.ndarra
 
     Raises
     ------
-    MapPointsError
+    SampledPointsError
         If no mixture has these shares.
     """
     weights = np.linalg.solve(np.vstack([shares, np.ones(3)]), [share_1m, share_2m, 1.0])
     if (weights < -1e-9).any():
         told = ", ".join(f"{kind} {weight:.2f}" for kind, weight in zip(KINDS, weights, strict=True))
-        raise MapPointsError(
+        raise SampledPointsError(
             f"no mixture of points has {share_1m:.2f} within 1 m and {share_2m:.2f} within 2 m here: it would need {told}"
         )
     return np.clip(weights, 0.0, 1.0)
 
 
-def measure_kinds(
+def measure_fractions(
     map_points: np.ndarray,
     poses: np.ndarray,
-    sight: Sight,
+    sight: VisiblePoints,
     front_end: FrontEnd,
     rng: np.random.Generator,
     n_scans: int = 100,
@@ -248,7 +233,7 @@ def measure_kinds(
         Points of the map [m].
     poses : array, shape (n, 3)
         Poses T_map_radar [m, m, rad].
-    sight : Sight
+    sight : VisiblePoints
         What these poses see.
     front_end : FrontEnd
         Errors and reach.
@@ -260,11 +245,11 @@ def measure_kinds(
     Returns
     -------
     shares : array, shape (2, 3)
-        For `mix_kinds`.
+        For `solve_mixture`.
 
     Raises
     ------
-    MapPointsError
+    SampledPointsError
         If none of these poses sees anything of the map.
     """
     tree, found = cKDTree(map_points), []
@@ -279,14 +264,14 @@ def measure_kinds(
                 ]
             )
     if not found:
-        raise MapPointsError("nothing of the map can be seen from any of the poses")
+        raise SampledPointsError("nothing of the map can be seen from any of the poses")
     return np.mean(found, axis=0)
 
 
-def draw_clouds(
+def sample_points(
     map_points: np.ndarray,
     poses: np.ndarray,
-    sight: Sight,
+    sight: VisiblePoints,
     front_end: FrontEnd,
     rng: np.random.Generator,
     parts: np.ndarray | None = None,
@@ -299,14 +284,14 @@ def draw_clouds(
         Points of the map [m].
     poses : array, shape (n, 3)
         True poses T_map_radar [m, m, rad].
-    sight : Sight
+    sight : VisiblePoints
         What these poses see.
     front_end : FrontEnd
         Shares, number of points, errors, reach, and how false points last.
     rng : numpy.random.Generator
         Source of randomness.
     parts : array, shape (3,), optional
-        Parts of the three kinds, from `mix_kinds`. Without them they are found at these poses; for a piece of a drive
+        Parts of the three kinds, from `solve_mixture`. Without them they are found at these poses; for a piece of a drive
         give those of the whole, or a dense place, where false points lie near the map by chance, would get hardly a
         true one.
 
@@ -318,12 +303,12 @@ def draw_clouds(
 
     Raises
     ------
-    MapPointsError
-        If the shares cannot be had on this map, see `mix_kinds`.
+    SampledPointsError
+        If the shares cannot be had on this map, see `solve_mixture`.
     """
     if parts is None:
-        kinds = measure_kinds(map_points, poses, sight, front_end, rng)
-        parts = mix_kinds(kinds, front_end.share_1m, front_end.share_2m)
+        kinds = measure_fractions(map_points, poses, sight, front_end, rng)
+        parts = solve_mixture(kinds, front_end.share_1m, front_end.share_2m)
     near, beside, false = (parts * front_end.n_points).round().astype(int)
     n_kept = round(false * front_end.persistent_share)
     standing, riding, tree = np.zeros((0, 2)), np.zeros((0, 2)), cKDTree(map_points)
@@ -332,12 +317,14 @@ def draw_clouds(
         standing = _renew(standing, pose, n_kept - n_kept // 2, front_end, rng)
         riding = _renew(riding, np.zeros(3), n_kept // 2, front_end, rng)
         again = np.concatenate([transform_points(invert(pose), standing), riding])
-        yield np.concatenate([
-            _draw_near(seen, near, front_end, rng),
-            _draw_beside(seen, beside, pose, tree, rng),
-            again + rng.normal(0.0, 0.1, again.shape),
-            _draw_anywhere(false - n_kept, front_end, rng),
-        ])  # fmt: skip
+        yield np.concatenate(
+            [
+                _draw_near(seen, near, front_end, rng),
+                _draw_beside(seen, beside, pose, tree, rng),
+                again + rng.normal(0.0, 0.1, again.shape),
+                _draw_anywhere(false - n_kept, front_end, rng),
+            ]
+        )
 
 
 def _draw_near(seen: np.ndarray, n: int, front_end: FrontEnd, rng: np.random.Generator) -> np.ndarray:

@@ -1,23 +1,48 @@
-"""Every page of the built book in a real browser, opened from disk: wide and light, narrow and dark, without a network.
+"""Check every page of the built book in Chromium: wide and light, narrow and dark, from disk, without a network.
 
-The rules are checked by `page.js` in the page and by `browser.py` from what the browser reports. That each of them can
-fail is seen on small pages with one fault each.
+Playwright drives the browser, axe checks contrast, names and headings, `page.js` checks the rest. Small pages with one
+fault each show that every rule can fail.
 """
 
 from __future__ import annotations
 
 import base64
+import os
+import shutil
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from urllib.parse import unquote, urlsplit
 
 import pytest
-from browser import Browser, BrowserError, View, Visit, find_chromium
+from axe_playwright_python.sync_playwright import Axe
+from playwright.sync_api import Browser, ConsoleMessage, Error, Request, sync_playwright
 
 from chapters import CHAPTERS
 
-WIDE, NARROW = View(1280), View(400, dark=True)
+NAMES = ("chromium", "chromium-browser", "google-chrome")
+OFFLINE = "--host-resolver-rules=MAP * ~NOTFOUND"  # no name is resolved, so nothing leaves the machine
+LOCAL = ("file:", "data:", "blob:", "about:")
+WIDE = {"viewport": {"width": 1280, "height": 900}, "color_scheme": "light"}
+NARROW = {"viewport": {"width": 400, "height": 900}, "color_scheme": "dark"}
+CHECKS = Path(__file__).with_name("page.js").read_text(encoding="utf-8")
+AXE = Axe()
+AXE.axe_script += "; axe.configure({rules: [{id: 'color-contrast', selector: '[data-sample]'}]})"
+AXE_RULES = {
+    "html-has-lang": "page",
+    "document-title": "page",
+    "role-img-alt": "image",
+    "link-name": "name",
+    "button-name": "name",
+    "summary-name": "name",
+    "label": "name",
+    "select-name": "name",
+    "heading-order": "heading",
+    "color-contrast": "contrast",
+}
+# Without `preload: false` axe itself requests every style sheet.
+AXE_OPTIONS = {"runOnly": list(AXE_RULES), "resultTypes": ["violations"], "preload": False}
 RULES = {
     "console": "no error and no warning",
     "request": "every file is there, and nothing is asked of a network",
@@ -33,20 +58,98 @@ RULES = {
     "width": "nothing is wider than the window",
     "contrast": "text stands out from its ground, 4.5 to 1, large text 3 to 1",
 }
-TABS = 2
 FIRST_SCREEN_PX = 800  # height of the window of a small laptop
 NEED_REAL_DATA = ("09_oxford_route", "10_real_radar")  # without it they have no picture
 
 
+@dataclass(frozen=True)
+class Visit:
+    """A page in one view: its address, the view, faults as (rule, words), and what the page holds.
+
+    ``links`` are pairs of the whole address and the attribute, ``anchors`` the names that can be linked to, ``counts``
+    the numbers of equations, images and canvases; ``theme`` is "light" or "dark"; ``picture`` is the lower edge of the
+    first picture [px].
+    """
+
+    address: str
+    view: dict
+    faults: list[tuple[str, str]]
+    links: list[tuple[str, str]]
+    anchors: list[str]
+    theme: str
+    counts: dict[str, int]
+    picture: int | None
+
+
+class Tab:
+    """A tab of the browser in one view, with the faults that it has reported since its page was opened."""
+
+    def __init__(self, browser: Browser, view: dict) -> None:
+        self.view, self.page = view, browser.new_page(**view)
+        self._faults: list[tuple[str, str]] = []
+        self.page.on("console", self._on_console)
+        self.page.on("pageerror", lambda error: self._faults.append(("console", str(error))))
+        self.page.on("request", self._on_request)
+        self.page.on(
+            "requestfailed",
+            lambda request: self._faults.append(("request", f"{request.failure}: {request.url}")),
+        )
+
+    def _on_console(self, message: ConsoleMessage) -> None:
+        if message.type in ("error", "warning", "assert"):
+            self._faults.append(("console", f"{message.type}: {message.text} {message.location['url']}"))
+
+    def _on_request(self, request: Request) -> None:
+        if not request.url.startswith(LOCAL):
+            self._faults.append(("request", f"asks the network: {request.url}"))
+
+    def visit(self, address: str) -> Visit:
+        """Open a page, wait until it is at rest, and check it by every rule."""
+        self._faults.clear()
+        self.page.goto(address)
+        seen = self.page.evaluate(CHECKS)
+        faults = [(rule, words) for rule, words in seen.pop("faults")]
+        for violation in AXE.run(self.page, options=AXE_OPTIONS).response["violations"]:
+            for node in violation["nodes"]:
+                words = f"{violation['id']}: {node['failureSummary']} {node['html']}"
+                faults.append((AXE_RULES[violation["id"]], " ".join(words.split())[:400]))
+        return Visit(address, self.view, [*self._faults, *faults], **seen)
+
+
+def find_chromium() -> str | None:
+    """Return the path of the browser: the environment's ``ROL_CHROMIUM``, else the first of the usual names."""
+    named = os.environ.get("ROL_CHROMIUM")
+    return next(filter(None, map(shutil.which, [named] if named else NAMES)), None)
+
+
+@contextmanager
+def launch(executable: str) -> Iterator[Browser]:
+    """Start a browser that resolves no name."""
+    with sync_playwright() as playwright:
+        yield playwright.chromium.launch(executable_path=executable, args=[OFFLINE])
+
+
 @pytest.fixture(scope="module")
-def chromium(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
-    """A browser for all tests of this file; without one they skip."""
+def chromium() -> Iterator[Browser]:
+    """One browser for all tests of this file; without one they skip.
+
+    It ends with the file: until then an event loop runs in this thread, which the tests of other files may not expect.
+    """
     executable = find_chromium()
     if executable is None:
         pytest.skip("no Chromium: install `chromium`, or name one in the environment variable ROL_CHROMIUM")
-    browser = Browser(executable, tmp_path_factory.mktemp("chromium"))
-    yield browser
-    browser.close()
+    with launch(executable) as browser:
+        yield browser
+
+
+@pytest.fixture(scope="module")
+def wide(chromium: Browser) -> Tab:
+    return Tab(chromium, WIDE)
+
+
+@pytest.fixture(scope="module")
+def narrow(chromium: Browser) -> Tab:
+    return Tab(chromium, NARROW)
 
 
 @pytest.fixture
@@ -67,21 +170,14 @@ def surveys() -> dict[Path, list[Visit]]:
 
 
 @pytest.fixture
-def visits(html: Path, chromium: Browser, surveys: dict[Path, list[Visit]]) -> list[Visit]:
+def visits(html: Path, wide: Tab, narrow: Tab, surveys: dict[Path, list[Visit]]) -> list[Visit]:
     if html not in surveys:
-        addresses, tabs = [page.as_uri() for page in pages_of(html)], [chromium.tab() for _ in range(TABS)]
-        with ThreadPoolExecutor(TABS) as pool:
-            shares = pool.map(survey, tabs, [addresses[k::TABS] for k in range(TABS)])
-            surveys[html] = [visit for share in shares for visit in share]
+        surveys[html] = [tab.visit(page.as_uri()) for page in pages_of(html) for tab in (wide, narrow)]
     return surveys[html]
 
 
-def survey(tab: object, addresses: list[str]) -> list[Visit]:
-    return [tab.visit(address, view) for address in addresses for view in (WIDE, NARROW)]
-
-
 def told(visit: Visit) -> str:
-    return f"{'/'.join(urlsplit(visit.address).path.split('/')[-2:])} at {visit.view.width} px"
+    return f"{'/'.join(urlsplit(visit.address).path.split('/')[-2:])} at {visit.view['viewport']['width']} px"
 
 
 def broken_links(visits: list[Visit]) -> list[str]:
@@ -140,43 +236,32 @@ def test_every_link_leads_somewhere(visits: list[Visit]) -> None:
 
 
 def test_pages_are_dark_for_whom_prefers_it(visits: list[Visit]) -> None:
-    assert all(visit.theme == ("dark" if visit.view.dark else "light") for visit in visits)
+    assert all(visit.theme == ("dark" if visit.view is NARROW else "light") for visit in visits)
 
 
-def test_search_finds_pages_without_a_network(html: Path, chromium: Browser) -> None:
-    tab = chromium.tab()
-    visit = tab.visit((html / "search.html").as_uri() + "?q=particle", WIDE)
-    assert not visit.faults
-    found = tab.run("""new Promise((done) => {
-        const look = (left) => {
-            const names = [...document.querySelectorAll("#search-results li a")].map((link) => link.href);
-            const isListed = names.some((name) => name.includes("07_localization"));
-            if (isListed || !left) done(names); else setTimeout(look, 100, left - 1);
-        };
-        look(100);
-    })""")
-    assert any("07_localization" in address for address in found), found
-    assert not [words for words in tab.visit(found[0], NARROW).faults if words[0] in ("console", "request")]
+def test_search_finds_pages_without_a_network(html: Path, wide: Tab, narrow: Tab) -> None:
+    assert not wide.visit((html / "search.html").as_uri() + "?q=particle").faults
+    found = wide.page.locator("#search-results li a[href*='07_localization']").first
+    address = found.evaluate("(link) => link.href")
+    assert not [words for rule, words in narrow.visit(address).faults if rule in ("console", "request")]
 
 
-def test_first_file_leads_to_the_first_page(html: Path, chromium: Browser) -> None:
-    tab = chromium.tab()
-    tab.open((html / "index.html").as_uri(), WIDE)
-    tab.wait_for("Page.loadEventFired", times=2)
-    assert tab.run("location.href") == (html / "intro.html").as_uri()
+def test_first_file_leads_to_the_first_page(html: Path, wide: Tab) -> None:
+    wide.page.goto((html / "index.html").as_uri())
+    wide.page.wait_for_url((html / "intro.html").as_uri())
 
 
 def test_print_is_black_on_white_and_has_no_controls(html: Path, chromium: Browser) -> None:
-    tab = chromium.tab()
-    page = next(page for page in pages_of(html) if "<canvas" in page.read_text(encoding="utf-8"))
-    tab.open(page.as_uri(), View(800, dark=True, medium="print"))
-    assert tab.run("document.documentElement.dataset.theme") == "dark"
-    assert tab.run("getComputedStyle(document.querySelector('article p')).color") == "rgb(0, 0, 0)"
-    assert tab.run("getComputedStyle(document.body).backgroundColor") == "rgb(255, 255, 255)"
-    controls = ".bd-sidebar-primary, .bd-header-article, article button, article input"
-    shown = f"[...document.querySelectorAll('{controls}')].filter((e) => e.checkVisibility()).length"
-    assert tab.run(shown) == 0
-    assert tab.run("document.documentElement.scrollWidth") <= 800
+    address = next(p for p in pages_of(html) if "<canvas" in p.read_text(encoding="utf-8")).as_uri()
+    with chromium.new_page(viewport={"width": 800, "height": 900}, color_scheme="dark") as page:
+        page.emulate_media(media="print")
+        page.goto(address)
+        assert page.evaluate("document.documentElement.dataset.theme") == "dark"
+        assert page.evaluate("getComputedStyle(document.querySelector('article p')).color") == "rgb(0, 0, 0)"
+        assert page.evaluate("getComputedStyle(document.body).backgroundColor") == "rgb(255, 255, 255)"
+        controls = page.locator(".bd-sidebar-primary, .bd-header-article, article button, article input")
+        assert controls.count() and not controls.filter(visible=True).count()
+        assert page.evaluate("document.documentElement.scrollWidth") <= 800
 
 
 # ---- the checker ----------------------------------------------------------------------------------------------
@@ -227,10 +312,10 @@ BAD = [
     ("animation", PLAYER.format(""), "does not play"),
     ("animation", PLAYS.replace("<button", "<button tabindex='-1'"), "keyboard"),
     ("animation", PLAYS.replace("</div>", f"<p hidden>{'a ' * 1_500_000}</p></div>"), "bytes"),
-    ("name", "<a href='#place'>here</a>", "says nothing"),
-    ("name", "<button></button>", "no name"),
-    ("name", "<input type='text'>", "no label"),
-    ("heading", "<h3>Too deep</h3>", "h3 after h1"),
+    ("name", "<a href='#place'>here</a>", "vague"),
+    ("name", "<button></button>", "button-name"),
+    ("name", "<input type='text'>", "label"),
+    ("heading", "<h3>Too deep</h3>", "heading-order"),
     ("heading", "<h1>Another</h1>", "2 headings of the first level"),
     ("table", "<table><tr><td>1</td></tr></table>", "no header"),
     ("width", "<div style='width: 1500px'>wide</div>", "reaches to 1508 px"),
@@ -253,37 +338,35 @@ def small_page(folder: Path, article: str = "", page: str = GOOD) -> str:
 @pytest.mark.parametrize(
     "article", ["", PLAYS, "<div style='overflow: auto'><p style='width: 1500px'>wide</p></div>"]
 )
-def test_good_page_has_no_fault(tmp_path: Path, chromium: Browser, article: str) -> None:
-    visit = chromium.shared_tab().visit(small_page(tmp_path, article), NARROW)
+def test_good_page_has_no_fault(tmp_path: Path, narrow: Tab, article: str) -> None:
+    visit = narrow.visit(small_page(tmp_path, article))
     assert not visit.faults and not broken_links([visit])
 
 
 @pytest.mark.parametrize(
     ("rule", "article", "words"), BAD, ids=[f"{k}-{bad[0]}" for k, bad in enumerate(BAD)]
 )
-def test_rule_bites(tmp_path: Path, chromium: Browser, rule: str, article: str, words: str) -> None:
-    faults = chromium.shared_tab().visit(small_page(tmp_path, article), NARROW).faults
+def test_rule_bites(tmp_path: Path, narrow: Tab, rule: str, article: str, words: str) -> None:
+    faults = narrow.visit(small_page(tmp_path, article)).faults
     assert any(name == rule and words in what for name, what in faults), faults
 
 
 @pytest.mark.parametrize(("before", "ends"), [("", 0), ("<div style='height: 2000px'>words</div>", 2000)])
-def test_place_of_the_first_picture_is_told(
-    tmp_path: Path, chromium: Browser, before: str, ends: int
-) -> None:
+def test_place_of_the_first_picture_is_told(tmp_path: Path, wide: Tab, before: str, ends: int) -> None:
     picture = "<img src='dot.png' alt='A dot' style='display: block; height: 300px'>"
-    visit = chromium.shared_tab().visit(small_page(tmp_path, before + picture), WIDE)
+    visit = wide.visit(small_page(tmp_path, before + picture))
     assert ends + 300 < visit.picture < ends + 500
-    assert chromium.shared_tab().visit(small_page(tmp_path), WIDE).picture is None  # a dot is no picture
+    assert wide.visit(small_page(tmp_path)).picture is None  # a dot is no picture
 
 
 @pytest.mark.parametrize(
     ("gone", "words"),
-    [(' lang="en"', "no language"), ("A page</title>", "no title"), ('rel="icon"', "no icon")],
+    [(' lang="en"', "html-has-lang"), ("A page</title>", "document-title"), ('rel="icon"', "no icon")],
 )
-def test_rule_of_the_page_bites(tmp_path: Path, chromium: Browser, gone: str, words: str) -> None:
+def test_rule_of_the_page_bites(tmp_path: Path, narrow: Tab, gone: str, words: str) -> None:
     page = GOOD.replace(gone, "</title>" if "title" in gone else "")
-    visit = chromium.shared_tab().visit(small_page(tmp_path, page=page), NARROW)
-    assert ("page", words) in visit.faults
+    faults = narrow.visit(small_page(tmp_path, page=page)).faults
+    assert any(rule == "page" and words in what for rule, what in faults), faults
 
 
 def test_every_rule_is_seen_to_bite() -> None:
@@ -291,22 +374,14 @@ def test_every_rule_is_seen_to_bite() -> None:
 
 
 @pytest.mark.parametrize("target", ["nowhere.html", "#nowhere", "page.html#nowhere", "dot.html?q=1"])
-def test_broken_link_is_found(tmp_path: Path, chromium: Browser, target: str) -> None:
-    visit = chromium.shared_tab().visit(small_page(tmp_path, f"<a href='{target}'>There it is</a>"), WIDE)
+def test_broken_link_is_found(tmp_path: Path, wide: Tab, target: str) -> None:
+    visit = wide.visit(small_page(tmp_path, f"<a href='{target}'>There it is</a>"))
     assert [line.rpartition(": ")[2] for line in broken_links([visit])] == [target]
 
 
-def test_page_that_is_not_there_is_an_error(tmp_path: Path, chromium: Browser) -> None:
-    with pytest.raises(BrowserError, match="nowhere"):
-        chromium.shared_tab().open((tmp_path / "nowhere.html").as_uri(), WIDE)
-
-
-def test_browser_that_does_not_start_says_so(tmp_path: Path) -> None:
-    program = tmp_path / "broken"
-    program.write_text("#!/bin/sh\necho no display today\n", encoding="utf-8")
-    program.chmod(0o755)
-    with pytest.raises(BrowserError, match="no display today"):
-        Browser(str(program), tmp_path)
+def test_page_that_is_not_there_is_an_error(tmp_path: Path, wide: Tab) -> None:
+    with pytest.raises(Error, match="nowhere"):
+        wide.visit((tmp_path / "nowhere.html").as_uri())
 
 
 def test_browser_is_found_by_the_environment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

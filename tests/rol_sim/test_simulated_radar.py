@@ -8,12 +8,13 @@ pytest.importorskip("open3d")
 from rol_sim.sensors import radar_signal
 from rol_sim.sensors.radar import RadarSettings, beam_azimuths, simulate_scan
 from rol_sim.sensors.radar_surfaces import Surface, surface_table
-from rol_sim.world.scene import Material, Scene, make_mesh, merge_meshes
+from rol_sim.world.mesh import Material, make_mesh, merge_meshes
+from rol_sim.world.scene import Scene
 from rol_study import radar_statistics as statistics
 
 pytestmark = pytest.mark.open3d
 
-QUIET = RadarSettings(interference_rate=0.0, haze_db=-80.0)
+QUIET = RadarSettings(interference_rate=0.0, clutter_tail_db=-80.0)
 FORBIDDEN = [1, 2, 3, 4, 5, 7, 8, 10, 11, 13, 16]
 STILL = np.zeros((400, 2))
 
@@ -89,7 +90,9 @@ def test_plate_behind_a_wall_is_hidden_and_behind_a_hedge_weaker():
     bare = strongest(scan(target), row, bin_)
     brick = Surface(0.3)  # neither mirror nor corners
     wall = plate(15.0, azimuth, width=6.0, height=12.0, material=Material.WALL, object_id=2)
-    settings = RadarSettings(interference_rate=0.0, haze_db=-80.0, streak_scale=0.0, surfaces={"WALL": brick})
+    settings = RadarSettings(
+        interference_rate=0.0, clutter_tail_db=-80.0, streak_scale=0.0, surfaces={"WALL": brick}
+    )
     hidden = strongest(scan(target, wall, settings=settings), row, bin_)
     hedge = plate(15.0, azimuth, width=6.0, height=12.0, material=Material.HEDGE, object_id=2)
     veiled = strongest(scan(target, hedge), row, bin_)
@@ -133,7 +136,7 @@ def test_mirror_wall_shows_a_ghost_behind_it():
     ]
     ghost, row = round(26.31 / 0.0438 - 0.5), int(np.argmin(np.abs(beam_azimuths() + 1.5 * np.pi)))
     with_ghost = strongest(scan(*walls), row, ghost, reach=10)
-    no_bounce = RadarSettings(interference_rate=0.0, haze_db=-80.0, bounces=0)
+    no_bounce = RadarSettings(interference_rate=0.0, clutter_tail_db=-80.0, bounces=0)
     assert with_ghost > 60
     assert strongest(scan(*walls, settings=no_bounce), row, ghost, reach=10) < with_ghost - 30
 
@@ -151,7 +154,7 @@ def test_empty_scan_has_the_noise_of_the_sensor():
     assert found["forbidden"] == 0
     measured = {3.0: 0.45, 28.0: 0.36, 41.0: 0.35, 80.0: 0.40, 106.0: 0.46, 145.0: 0.50}
     for range_m, share in measured.items():  # real quiet cells hold clutter and streaks too, so fewer zeros
-        assert share - 0.04 < found["zero_shares"][range_m] < share + 0.15
+        assert share - 0.04 < found["zero_fractions"][range_m] < share + 0.15
     np.testing.assert_allclose(
         found["range_correlation"], [0.93, 0.85, 0.74, 0.61, 0.49, 0.37, 0.28], atol=0.08
     )
@@ -204,7 +207,7 @@ def test_statistics_of_real_scans_are_those_measured(real_root):
         assert found["shares"][code] == pytest.approx(share, rel=0.1)
     measured = {3.0: 0.45, 28.0: 0.36, 41.0: 0.35, 80.0: 0.40, 106.0: 0.46, 145.0: 0.50}
     for range_m, share in measured.items():
-        assert found["zero_shares"][range_m] == pytest.approx(share, abs=0.04)
+        assert found["zero_fractions"][range_m] == pytest.approx(share, abs=0.04)
     np.testing.assert_allclose(
         found["range_correlation"], [0.93, 0.85, 0.74, 0.61, 0.49, 0.37, 0.28], atol=0.025
     )

@@ -15,8 +15,8 @@ from rol.evaluation import read_tum
 from rol.geometry import accumulate_increments, compose, invert, transform_points
 from rol_sim.__main__ import main
 from rol_sim.session import logs, writer
-from rol_sim.session.assembly import build_session, label_sweep, list_labels
 from rol_sim.session.settings import SettingsError, load_settings, parse_settings, read_settings
+from rol_sim.session.simulation import build_session, label_sweep, list_labels
 from rol_sim.world.mesh import GROUND_MATERIALS, Material
 
 pytestmark = pytest.mark.open3d
@@ -287,7 +287,7 @@ def test_points_of_scan_and_sweep_lie_on_the_town(folder: Path, recipe: Path) ->
     points, materials = label_sweep(folder, "velodyne_right", stamp)
     T_radar_lidar = np.linalg.inv(oxford.EXTRINSICS["radar"]) @ oxford.EXTRINSICS["velodyne_right"]
     in_radar = points[:, :3] @ T_radar_lidar[:3, :3].T + T_radar_lidar[:3, 3]
-    pose = session.drive.pose(np.array([stamp + 25_000]))[0]
+    pose = session.trajectory.pose(np.array([stamp + 25_000]))[0]
     at = transform_points(pose, in_radar[materials == Material.FACADE, :2])
     gaps = []
     for footprint in session.town.footprints:

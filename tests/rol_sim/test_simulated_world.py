@@ -1,4 +1,4 @@
-"""The simulated town: rays against bodies worked out by hand, rules that every town keeps, the drive, the lidar."""
+"""The simulated town: rays against bodies worked out by hand, rules that every town keeps, the trajectory, the lidar."""
 
 import numpy as np
 import pytest
@@ -8,7 +8,7 @@ pytest.importorskip("open3d")
 from rol.geometry import compose
 from rol.oxford import EXTRINSICS, VelodyneRaw, velodyne_raw_to_points
 from rol_sim.drive import traffic
-from rol_sim.drive.planned import Route, build_route, plan_drive
+from rol_sim.drive.town_loop import Route, build_route, plan_trajectory
 from rol_sim.sensors import lidar as lidar_sensor
 from rol_sim.sensors.lidar import LidarSettings, schedule_firings, simulate_sweep
 from rol_sim.world import town as world
@@ -29,8 +29,8 @@ def town() -> world.Town:
 
 
 @pytest.fixture(scope="module")
-def drive(town: world.Town):
-    return plan_drive(build_route(town.plan), STAMP, 40.0, np.random.default_rng(5))
+def trajectory(town: world.Town):
+    return plan_trajectory(build_route(town.plan), STAMP, 40.0, np.random.default_rng(5))
 
 
 def wall(x: float, material: int, number: int):
@@ -87,17 +87,15 @@ def test_moving_bodies_share_the_standing_scene() -> None:
     assert behind.cast(ray).material[0] == Material.FACADE
 
 
-def test_all_hits_are_sorted() -> None:
+def test_first_hits_of_standing_and_moving_walls() -> None:
     scene = Scene([wall(9.0, Material.WALL, 2), wall(5.0, Material.FACADE, 1)])
     scene = scene.with_moving(wall(7.0, Material.VEHICLE, 3))
     slanted = np.array([0.8, 0.0, 0.6])
-    rays = np.array([[0, 0.3, 0.1, 1, 0, 0], [0, 9, 0, 1, 0, 0], [4.2, 0.3, -0.5, *slanted]])
-    found = scene.cast_through(rays, max_t=8.0)
-    assert found.ray_index.tolist() == [0, 0, 2]
-    np.testing.assert_allclose(found.t, [5.0, 7.0, 1.0], rtol=1e-6)
-    assert found.material.tolist() == [Material.FACADE, Material.VEHICLE, Material.FACADE]
-    np.testing.assert_allclose(found.cos_incidence, [1, 1, 0.8], atol=1e-6)
-    assert len(scene.cast_through(rays[1:2]).t) == 0
+    rays = np.array([[5.5, 0.3, 0.1, 1, 0, 0], [0, 9, 0, 1, 0, 0], [4.2, 0.3, -0.5, *slanted]])
+    found = scene.cast(rays)
+    np.testing.assert_allclose(found.t, [1.5, np.inf, 1.0], rtol=1e-6)
+    assert found.material.tolist() == [Material.VEHICLE, Material.NONE, Material.FACADE]
+    np.testing.assert_allclose(found.cos_incidence, [1, 0, 0.8], atol=1e-6)
 
 
 def test_scene_refuses_nonsense() -> None:
@@ -229,7 +227,7 @@ def test_no_direction_is_empty(town: world.Town) -> None:
 
 
 def test_sessions_dress_the_town_differently(town: world.Town) -> None:
-    first, other = (world.dress(town, np.random.default_rng(k)) for k in (1, 2))
+    first, other = (world.add_session_objects(town, np.random.default_rng(k)) for k in (1, 2))
     assert len(first.triangles) != len(other.triangles)
     assert first.objects.min() == town.mesh.objects.max() + 1
     found = {Material(number) for number in np.unique(first.materials)}
@@ -240,13 +238,13 @@ def test_sessions_dress_the_town_differently(town: world.Town) -> None:
         Material.TREE_TRUNK,
         Material.METAL,
     }
-    bare = world.dress(town, np.random.default_rng(1), parked_share=0.0, leaf_density=0.5)
+    bare = world.add_session_objects(town, np.random.default_rng(1), parked_share=0.0, leaf_density=0.5)
     assert not (bare.materials == Material.VEHICLE).any()
     ratio = (bare.materials == Material.TREE_CROWN).sum() / (first.materials == Material.TREE_CROWN).sum()
     assert 0.45 < ratio < 0.55
 
 
-# ---- the drive ----
+# ---- the trajectory ----
 
 
 def test_route_is_closed_and_smooth(town: world.Town) -> None:
@@ -262,30 +260,32 @@ def test_route_is_closed_and_smooth(town: world.Town) -> None:
     np.testing.assert_allclose(np.linalg.norm(left[:, :2] - route.place(s, 0.0)[:, :2], axis=1), 2.0)
 
 
-def test_drive_obeys_physics(town: world.Town, drive) -> None:
+def test_drive_obeys_physics(town: world.Town, trajectory) -> None:
     dt = 0.005
-    assert drive.stamps_us[0] == STAMP - 1_000_000 and drive.stamps_us[-1] >= STAMP + 41_000_000
+    assert trajectory.stamps_us[0] == STAMP - 1_000_000 and trajectory.stamps_us[-1] >= STAMP + 41_000_000
     assert (
-        drive.speeds[0] == 0.0 and np.abs(drive.speeds[: int(1.5 / dt)]).max() < 0.05
+        trajectory.speeds[0] == 0.0 and np.abs(trajectory.speeds[: int(1.5 / dt)]).max() < 0.05
     )  # stands at the start
-    assert drive.speeds.min() > -1e-6 and 7.0 < drive.speeds.max() < 10.0
-    acceleration = np.gradient(drive.speeds, dt)
+    assert trajectory.speeds.min() > -1e-6 and 7.0 < trajectory.speeds.max() < 10.0
+    acceleration = np.gradient(trajectory.speeds, dt)
     assert acceleration.min() > -1.9 and acceleration.max() < 1.5
-    step = np.diff(drive.poses, axis=0)
+    step = np.diff(trajectory.poses, axis=0)
     forward = np.hypot(step[:, 0], step[:, 1])
-    np.testing.assert_allclose(forward.sum(), np.sum(drive.speeds[:-1] * dt), rtol=1e-3)
+    np.testing.assert_allclose(forward.sum(), np.sum(trajectory.speeds[:-1] * dt), rtol=1e-3)
     moving = forward > 0.01
     direction = np.arctan2(step[moving, 1], step[moving, 0])
-    slip = (direction - drive.poses[:-1][moving, 2] + np.pi) % (2 * np.pi) - np.pi
+    slip = (direction - trajectory.poses[:-1][moving, 2] + np.pi) % (2 * np.pi) - np.pi
     assert np.abs(slip).max() < 0.02  # the car goes where it points
-    assert np.abs(drive.speeds[:-1][moving] * step[moving, 2] / dt).max() < 2.6  # lateral acceleration
-    assert town.plan.clearance(drive.poses[:, :2]).max() < -1.5  # half a car's width and more from the kerb
+    assert np.abs(trajectory.speeds[:-1][moving] * step[moving, 2] / dt).max() < 2.6  # lateral acceleration
+    assert (
+        town.plan.clearance(trajectory.poses[:, :2]).max() < -1.5
+    )  # half a car's width and more from the kerb
 
 
 def test_drive_stops_on_the_way(town: world.Town) -> None:
     route = build_route(town.plan)
     for stops in (0, 1, 2):
-        d = plan_drive(route, STAMP, 60.0, np.random.default_rng(2), n_stops=stops, stand_s=1.0)
+        d = plan_trajectory(route, STAMP, 60.0, np.random.default_rng(2), n_stops=stops, stand_s=1.0)
         is_standing = d.speeds < 0.02
         begins = np.flatnonzero(is_standing[1:] & ~is_standing[:-1])
         assert len(begins) == stops
@@ -294,31 +294,32 @@ def test_drive_stops_on_the_way(town: world.Town) -> None:
 def test_sessions_start_a_few_metres_apart(town: world.Town) -> None:
     route = build_route(town.plan)
     starts = [
-        plan_drive(route, STAMP, 5.0, np.random.default_rng(k), start_m=20.0).progress[0] for k in range(12)
+        plan_trajectory(route, STAMP, 5.0, np.random.default_rng(k), start_m=20.0).progress[0]
+        for k in range(12)
     ]
     offsets = np.abs(np.array(starts) - 20.0)
     assert offsets.min() >= 1.0 and offsets.max() <= 4.0
 
 
-def test_drive_interpolates_and_refuses_times_outside(drive) -> None:
-    middle = drive.pose(np.array([drive.stamps_us[4000] + 2_500]))[0]
-    np.testing.assert_allclose(middle[:2], drive.poses[4000:4002, :2].mean(axis=0), atol=1e-9)
-    velocity = drive.velocity(drive.stamps_us[4000:4001])[0]
-    np.testing.assert_allclose(np.hypot(*velocity), drive.speeds[4000])
-    with pytest.raises(ValueError, match="lies outside the drive"):
-        drive.pose(np.array([drive.stamps_us[-1] + 1]))
+def test_drive_interpolates_and_refuses_times_outside(trajectory) -> None:
+    middle = trajectory.pose(np.array([trajectory.stamps_us[4000] + 2_500]))[0]
+    np.testing.assert_allclose(middle[:2], trajectory.poses[4000:4002, :2].mean(axis=0), atol=1e-9)
+    velocity = trajectory.velocity(trajectory.stamps_us[4000:4001])[0]
+    np.testing.assert_allclose(np.hypot(*velocity), trajectory.speeds[4000])
+    with pytest.raises(ValueError, match="lies outside the trajectory"):
+        trajectory.pose(np.array([trajectory.stamps_us[-1] + 1]))
     route = Route(np.zeros((4, 2)), 1.0, np.zeros(0))
     with pytest.raises(ValueError, match="must be positive"):
-        plan_drive(route, STAMP, -1.0, np.random.default_rng(0))
+        plan_trajectory(route, STAMP, -1.0, np.random.default_rng(0))
 
 
-def test_nobody_drives_through_the_car(town: world.Town, drive) -> None:
+def test_nobody_drives_through_the_car(town: world.Town, trajectory) -> None:
     cars = traffic.plan_traffic(
-        town.plan, build_route(town.plan), drive, np.random.default_rng(8), n_vehicles=14, n_people=5
+        town.plan, build_route(town.plan), trajectory, np.random.default_rng(8), n_vehicles=14, n_people=5
     )
     assert len(cars.meshes) == 19
     for stamp in range(STAMP, STAMP + 40_000_000, 200_000):
-        own = drive.pose(np.array([stamp]))[0]
+        own = trajectory.pose(np.array([stamp]))[0]
         numbers, poses, _ = cars.bodies_at(stamp, own)
         assert len(numbers) == 19
         for mesh, pose in zip(cars.meshes, poses, strict=True):
@@ -331,7 +332,7 @@ def test_nobody_drives_through_the_car(town: world.Town, drive) -> None:
     everyone = cars.meshes_at(town.plan.ground, STAMP, 1000, np.zeros(2), radius=1e4)
     assert set(near.objects) < set(everyone.objects) == set(range(1000, 1019))
     nobody = traffic.plan_traffic(
-        town.plan, build_route(town.plan), drive, np.random.default_rng(8), n_vehicles=0, n_people=0
+        town.plan, build_route(town.plan), trajectory, np.random.default_rng(8), n_vehicles=0, n_people=0
     )
     assert len(nobody.meshes_at(town.plan.ground, STAMP, 0, np.zeros(2)).triangles) == 0
 

@@ -12,10 +12,10 @@ from scipy.spatial import cKDTree
 
 from rol.geometry import transform_points
 from rol.pix2pix import TrainedNetwork
-from rol_beyond import front_ends
-from rol_beyond.front_ends import detect_points, judge_on_map
+from rol_beyond.front_ends import detect_points, evaluate_on_map
 from rol_data import rall
-from rol_study.rendered_points import build_stretch, render_clouds, true_twists
+from rol_study import rendered_points
+from rol_study.rendered_points import build_segment, render_points, true_twists
 
 pytestmark = pytest.mark.open3d
 QUIET = {"vehicles": 0, "people": 0, "parked_share": 0.0}
@@ -52,28 +52,28 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
     given: list[Any] = []
 
     def detect(
-        translator: TrainedNetwork, codes: np.ndarray, azimuths: np.ndarray, twist: Any, **how: Any
+        network: TrainedNetwork, power: np.ndarray, azimuths: np.ndarray, twist: Any, **how: Any
     ) -> Any:
-        given.append((translator, twist, how))
-        return detect_points(codes, azimuths, twist), None, None
+        given.append((network, twist, how))
+        return detect_points(power, azimuths, twist), None, None
 
-    monkeypatch.setattr(front_ends, "translate_scan", detect)
+    monkeypatch.setattr(rendered_points, "generate_points", detect)
     return given
 
 
 def test_clouds_lie_on_the_map_at_their_poses(small_root: Path, asked: list[Any]) -> None:
     tree = cKDTree(rall.load_map_points(small_root / rall.MAP_PATH))
-    clouds = render_clouds(small_root, "02", 4, 5, NOBODY, 3, bf16=True, headings=2, **QUIET)
+    clouds = render_points(small_root, "02", 4, 5, NOBODY, 3, bf16=True, tta_rotations=2, **QUIET)
     assert isinstance(clouds, Iterator) and not asked  # nothing is rendered before it is asked for
     poses = drive_poses()[4:9]
     right, wrong = ([], [])
     for cloud, pose in zip(clouds, poses, strict=True):
         assert cloud.ndim == 2 and cloud.shape[1] == 2 and len(cloud) > 100
         near = cloud[np.abs(transform_points(pose, cloud)[:, 1] - 14.0) < 4.0]
-        right.append(judge_on_map(near, pose, tree)["share_1m"])
-        wrong.append(judge_on_map(near, pose + (0.0, 3.0, 0.0), tree)["share_1m"])
+        right.append(evaluate_on_map(near, pose, tree)["share_1m"])
+        wrong.append(evaluate_on_map(near, pose + (0.0, 3.0, 0.0), tree)["share_1m"])
     assert np.mean(right) > 0.6 and np.mean(wrong) < 0.5 * np.mean(right)
-    assert all(translator is NOBODY and how == {"bf16": True, "headings": 2} for translator, _, how in asked)
+    assert all(network is NOBODY and how == {"bf16": True, "tta_rotations": 2} for network, _, how in asked)
     speeds = np.array([twist for _, twist, _ in asked])
     np.testing.assert_allclose(speeds[:, 0], 10.0, atol=0.3)
     np.testing.assert_allclose(speeds[:, 2], 0.04, atol=0.01)
@@ -81,7 +81,7 @@ def test_clouds_lie_on_the_map_at_their_poses(small_root: Path, asked: list[Any]
 
 def test_a_seed_gives_the_same_clouds_one_scan_at_a_time(small_root: Path, asked: list[Any]) -> None:
     def take(number: str, seed: int) -> list[np.ndarray]:
-        return list(itertools.islice(render_clouds(small_root, number, 0, 12, NOBODY, seed), 2))
+        return list(itertools.islice(render_points(small_root, number, 0, 12, NOBODY, seed), 2))
 
     one, again, other, day = take("02", 3), take("02", 3), take("02", 4), take("07", 3)
     assert len(asked) == 8  # two of twelve each time
@@ -91,12 +91,14 @@ def test_a_seed_gives_the_same_clouds_one_scan_at_a_time(small_root: Path, asked
 
 
 def test_velocities_are_those_of_the_poses(small_root: Path) -> None:
-    session = build_stretch(small_root, "02", 0, 0, 3, **QUIET)
+    session = build_segment(small_root, "02", 0, 0, 3, **QUIET)
     twists = true_twists(session)
     assert len(twists) == 12
     middles = session.scans_us + session.turns_us // 2
-    np.testing.assert_allclose(session.drive.pose(middles), drive_poses(), atol=1e-3)
-    np.testing.assert_allclose(twists[1:-1, 0], np.hypot(*session.drive.velocity(middles).T)[1:-1], rtol=0.02)
+    np.testing.assert_allclose(session.trajectory.pose(middles), drive_poses(), atol=1e-3)
+    np.testing.assert_allclose(
+        twists[1:-1, 0], np.hypot(*session.trajectory.velocity(middles).T)[1:-1], rtol=0.02
+    )
 
 
 @pytest.mark.parametrize(
@@ -114,14 +116,14 @@ def test_scans_that_are_not_there_are_refused_at_once(
     small_root: Path, number: str, first: int, n: int, fault: str
 ) -> None:
     with pytest.raises(ValueError, match=fault):
-        render_clouds(small_root, number, first, n, NOBODY, 3)
+        render_points(small_root, number, first, n, NOBODY, 3)
 
 
 def test_other_faults_are_named(small_root: Path, tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="no real data in"):
-        render_clouds(tmp_path, "02", 0, 3, NOBODY, 3)
+        render_points(tmp_path, "02", 0, 3, NOBODY, 3)
     with pytest.raises(ValueError, match="unknown key 'clouds'"):
-        render_clouds(small_root, "02", 0, 3, NOBODY, 3, clouds=1)
+        render_points(small_root, "02", 0, 3, NOBODY, 3, clouds=1)
 
 
 @pytest.mark.torch
@@ -132,7 +134,7 @@ def test_an_untrained_network_on_the_real_route(real_root: Path) -> None:
 
     generator = build_generator(2, 1, rng=torch.Generator().manual_seed(1))
     generator.image_size = (512, 512)
-    translator = TrainedNetwork(generator, {"threshold": 1}, {}, {})
-    clouds = list(render_clouds(real_root, "02", 6000, 3, translator, 3))
+    network = TrainedNetwork(generator, {"threshold": 1}, {}, {})
+    clouds = list(render_points(real_root, "02", 6000, 3, network, 3))
     assert len(clouds) == 3 and all(len(cloud) > 100 for cloud in clouds)
     assert max(np.abs(cloud).max() for cloud in clouds) < 64.0 * np.sqrt(2.0)

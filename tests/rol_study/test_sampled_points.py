@@ -5,7 +5,13 @@ import pytest
 from scipy.spatial import cKDTree
 
 from rol.geometry import transform_points
-from rol_study.sampled_points import FrontEnd, MapPointsError, draw_clouds, look_around, mix_kinds
+from rol_study.sampled_points import (
+    FrontEnd,
+    SampledPointsError,
+    find_visible_points,
+    sample_points,
+    solve_mixture,
+)
 
 WALL = np.column_stack([np.full(160, 10.125), np.arange(-20.0, 20.0, 0.25) + 0.125])
 SECOND, THIRD = WALL + (5.0, 0.0), WALL + (10.0, 0.0)
@@ -15,37 +21,37 @@ STREETS = np.concatenate([WALL, WALL - (25.0, 0.0), np.random.default_rng(0).uni
 def test_a_beam_is_spent_after_so_many_surfaces() -> None:
     pose = np.array([[0.0, 0.0, 0.0]])
     for n_surfaces, seen in ((1, {10}), (2, {10, 15}), (3, {10, 15, 20})):
-        sight = look_around(np.concatenate([WALL, SECOND, THIRD]), pose, n_surfaces=n_surfaces)
+        sight = find_visible_points(np.concatenate([WALL, SECOND, THIRD]), pose, n_surfaces=n_surfaces)
         assert set(np.floor(sight[0][:, 0]).astype(int)) == seen
 
 
 def test_what_is_seen_is_in_the_frame_of_the_radar_and_within_its_reach() -> None:
     pose = np.array([[3.0, 4.0, np.pi / 2.0]])  # looks along the wall, which is to its right
-    sight = look_around(WALL, pose, max_range_m=15.0)
+    sight = find_visible_points(WALL, pose, max_range_m=15.0)
     placed = transform_points(pose[0], sight[0])
     assert np.abs(placed[:, 0] - 10.125).max() < 0.02 and np.hypot(*sight[0].T).max() < 15.3
     assert (sight[0][:, 1] < 0).all() and len(np.unique(sight.points, axis=0)) == len(sight.points)
-    nothing = look_around(WALL, np.array([[500.0, 0.0, 0.0], *pose]))
+    nothing = find_visible_points(WALL, np.array([[500.0, 0.0, 0.0], *pose]))
     assert len(nothing) == 2 and len(nothing[0]) == 0 and len(nothing[1]) > 50
 
 
 def test_kinds_are_mixed_so_that_the_shares_come_out() -> None:
     shares = np.array([[1.0, 0.0, 0.3], [1.0, 1.0, 0.5]])
-    parts = mix_kinds(shares, 0.4, 0.6)
+    parts = solve_mixture(shares, 0.4, 0.6)
     # 0.16 + 0.3 * 0.8 = 0.4, and 0.16 + 0.04 + 0.5 * 0.8 = 0.6
     np.testing.assert_allclose(parts, [0.16, 0.04, 0.8])
     with pytest.raises(
-        MapPointsError, match="0.10 within 1 m and 0.20 within 2 m here: it would need near -0"
+        SampledPointsError, match="0.10 within 1 m and 0.20 within 2 m here: it would need near -0"
     ):
-        mix_kinds(shares, 0.1, 0.2)
+        solve_mixture(shares, 0.1, 0.2)
 
 
 @pytest.mark.parametrize(("share_1m", "share_2m"), [(0.4, 0.6), (0.8, 0.9)])
 def test_clouds_have_the_shares_asked_for(share_1m: float, share_2m: float) -> None:
     poses = np.column_stack([np.linspace(-5, 5, 40), np.zeros(40), np.linspace(0, 1, 40)])
     front_end = FrontEnd(share_1m, share_2m, n_points=300)
-    sight, rng = look_around(STREETS, poses), np.random.default_rng(1)
-    clouds = list(draw_clouds(STREETS, poses, sight, front_end, rng))
+    sight, rng = find_visible_points(STREETS, poses), np.random.default_rng(1)
+    clouds = list(sample_points(STREETS, poses, sight, front_end, rng))
     tree = cKDTree(STREETS)
     away = [tree.query(transform_points(p, c))[0] for p, c in zip(poses, clouds, strict=True)]
     shares = [[np.mean(d < radius) for d in away] for radius in (1.0, 2.0)]
@@ -55,9 +61,9 @@ def test_clouds_have_the_shares_asked_for(share_1m: float, share_2m: float) -> N
 
 def test_same_seed_same_clouds() -> None:
     poses = np.zeros((3, 3))
-    sight = look_around(STREETS, poses)
+    sight = find_visible_points(STREETS, poses)
     first, again = (
-        list(draw_clouds(STREETS, poses, sight, FrontEnd(), np.random.default_rng(5))) for _ in range(2)
+        list(sample_points(STREETS, poses, sight, FrontEnd(), np.random.default_rng(5))) for _ in range(2)
     )
     for a, b in zip(first, again, strict=True):
         np.testing.assert_array_equal(a, b)
@@ -75,19 +81,19 @@ def test_false_points_last_as_long_as_stated() -> None:
         assert len(points) == 100
         stayed.append(len(before & {tuple(p) for p in points}))
     assert np.mean(stayed[10:]) == pytest.approx(80.0, abs=3.0)  # four of five go on
-    assert len(look_around(far, poses[:1])[0]) == 0
+    assert len(find_visible_points(far, poses[:1])[0]) == 0
 
 
 def test_a_map_without_points_or_out_of_sight_is_refused() -> None:
-    with pytest.raises(MapPointsError, match="holds no point"):
-        look_around(np.zeros((0, 2)), np.zeros((1, 3)))
+    with pytest.raises(SampledPointsError, match="holds no point"):
+        find_visible_points(np.zeros((0, 2)), np.zeros((1, 3)))
     poses = np.zeros((2, 3))
-    with pytest.raises(MapPointsError, match="nothing of the map can be seen"):
+    with pytest.raises(SampledPointsError, match="nothing of the map can be seen"):
         next(
-            draw_clouds(
+            sample_points(
                 WALL + (900.0, 0.0),
                 poses,
-                look_around(WALL + (900.0, 0.0), poses),
+                find_visible_points(WALL + (900.0, 0.0), poses),
                 FrontEnd(),
                 np.random.default_rng(0),
             )

@@ -151,7 +151,7 @@ def test_rerun_is_compared_with_its_session_and_method(build: dict, tmp_path: Pa
     assert [row.result for row in compare_rerun(tmp_path, rmse_m=0.3)] == [check.OUTSIDE]
 
 
-@pytest.mark.parametrize("other", [{"session": "seq09"}, {"method": "rol"}])
+@pytest.mark.parametrize("other", [{"session": "seq09"}, {"method": "robust"}])
 def test_rerun_without_a_reference_is_refused(build: dict, tmp_path: Path, other: dict) -> None:
     with pytest.raises(ChapterError, match="mine.json: no reference for session "):
         compare_rerun(tmp_path, **other)

@@ -1,5 +1,6 @@
 """The staging of the book: its settings where the address of the repository is known, and the pages' own extension."""
 
+import ast
 import base64
 import importlib.util
 import itertools
@@ -139,15 +140,40 @@ def test_metadata_files_of_macos_are_passed_over(tmp_path: Path, monkeypatch: py
         (folder / f"._x.{kind}").write_bytes(b"\0\5\x16\7\xff")
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(chapters, "SOURCE", package.parent)
-    monkeypatch.setattr(toolbox_pages, "PACKAGE", package)
+    monkeypatch.setattr(toolbox_pages, "SOURCE", package.parent)
     monkeypatch.setattr(stage_book, "ROOT", tmp_path)
     for name in ("stage_notebooks", "stage_result_figure"):
         monkeypatch.setattr(stage_book, name, lambda *_: None)
     monkeypatch.setattr(stage_book, "how_made_page", lambda *_: "")
     staged = stage_book.stage(str(ROOT / "config/smoke.yaml"))
-    assert (staged / "toolbox/mcl.md").is_file() and (staged / "intro.md").is_file()
+    assert (staged / "toolbox/rol/mcl.md").is_file() and (staged / "intro.md").is_file()
     assert not list(staged.rglob("._*"))
     assert chapters.stored_digest(new_notebook(), chapters.load_config(ROOT / "config/smoke.yaml"))
+
+
+# ---- the toolbox ----------------------------------------------------------------------------------------------
+
+
+def test_toolbox_has_a_page_for_each_package_and_module(tmp_path: Path) -> None:
+    text = "### [mcl](toolbox/rol/mcl.md)\n### [bev](toolbox/rol_other/bev.md)\n"
+    (tmp_path / "take.md").write_text(text, encoding="utf-8")
+    entries = stage_book.stage_toolbox(tmp_path)
+    pages = [page["file"] for entry in entries for page in (entry, *entry["sections"])]
+    staged = {
+        path.relative_to(tmp_path).with_suffix("").as_posix() for path in tmp_path.rglob("toolbox/**/*.md")
+    }
+    assert {*pages, "toolbox/index"} == staged and len(pages) == len(staged) - 1
+    files = [file for file in chapters.SOURCE.rglob("[!.]*.py") if not file.name.startswith("__")]
+    folders = {file.relative_to(chapters.SOURCE).parts[0] for file in files}
+    assert len(pages) == len(files) + len(folders)
+    for folder in folders:  # Sphinx gives a package without one no place to link to
+        init = chapters.SOURCE / folder / "__init__.py"
+        assert ast.get_docstring(ast.parse(init.read_text(encoding="utf-8"))), f"{init}: no docstring"
+    page = (tmp_path / "toolbox/rol/mcl.md").read_text(encoding="utf-8")
+    assert "# rol.mcl\n" in page and "File: `src/rol/mcl.py`. [Example" in page
+    assert "(../../take.md#mcl)" in page
+    assert ".. autofunction:: localize\n" in page and ".. autoclass:: MclSettings\n   :members:" in page
+    assert "take.md" not in (tmp_path / "toolbox/rol/bev.md").read_text(encoding="utf-8")
 
 
 # ---- the pages' own extension ---------------------------------------------------------------------------------

@@ -7,18 +7,16 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from rol.geometry import wrap_angle
+from rol_sim.drive.town_loop import Route, Trajectory
+from rol_sim.world.mesh import Mesh, merge_meshes, move_mesh
+from rol_sim.world.streets import StreetPlan
+from rol_sim.world.vehicles import MOVING_KINDS, build_cyclist, build_pedestrian, build_vehicle, draw_kind
 
-if TYPE_CHECKING:
-    from rol_sim.drive.planned import Drive, Route
-    from rol_sim.world.mesh import Mesh
-    from rol_sim.world.streets import StreetPlan
-
-STEP_US = 50_000  # traffic is kept at 20 Hz
+TRACK_STEP_US = 50_000  # traffic is kept at 20 Hz
 EDGE = 3.0  # a body stays that many steps before its first and after its last pose
 
 
@@ -64,7 +62,7 @@ class Traffic:
         velocities : array, shape (k, 2)
             Velocity of each in the world [m/s].
         """
-        u = (stamp_us - self.first_stamps_us) / STEP_US
+        u = (stamp_us - self.first_stamps_us) / TRACK_STEP_US
         last = np.array([len(track) - 1 for track in self.tracks], dtype=np.int64)
         found = []
         for i in np.flatnonzero((u >= -EDGE) & (u <= last + EDGE)):
@@ -72,7 +70,7 @@ class Traffic:
             step = self.tracks[i][k + 1] - self.tracks[i][k]
             pose = self.tracks[i][k] + min(max(u[i] - k, 0.0), 1.0) * step
             if np.hypot(*(pose[:2] - np.asarray(middle)[:2])) < radius:
-                found.append((i, pose, step[:2] / (STEP_US * 1e-6)))
+                found.append((i, pose, step[:2] / (TRACK_STEP_US * 1e-6)))
         numbers, poses, velocities = zip(*found, strict=True) if found else ((), (), ())
         shapes = (-1,), (-1, 3), (-1, 2)
         values = np.array(numbers, dtype=np.int64), np.array(poses), np.array(velocities)
@@ -106,20 +104,20 @@ class Traffic:
         mesh : Mesh
             The bodies; empty if there are none.
         """
-        from rol_sim.world.mesh import merge_meshes, move_mesh
-
         numbers, poses, _ = self.bodies_at(stamp_us, middle, radius)
         heights = ground(poses[:, :2])
-        return merge_meshes([
-            move_mesh(self.meshes[i], pose, h, first_object + int(i))
-            for i, pose, h in zip(numbers, poses, heights, strict=True)
-        ])  # fmt: skip
+        return merge_meshes(
+            [
+                move_mesh(self.meshes[i], pose, h, first_object + int(i))
+                for i, pose, h in zip(numbers, poses, heights, strict=True)
+            ]
+        )
 
 
 def plan_traffic(
     plan: StreetPlan,
     route: Route,
-    drive: Drive,
+    trajectory: Trajectory,
     rng: np.random.Generator,
     *,
     n_vehicles: int = 16,
@@ -133,8 +131,8 @@ def plan_traffic(
         The streets.
     route : Route
         The loop; its traffic comes towards the car, leads or follows it.
-    drive : Drive
-        The car's own drive, so that nobody drives through it.
+    trajectory : Trajectory
+        The car's own trajectory, so that nobody drives through it.
     rng : numpy.random.Generator
         Draws everything.
     n_vehicles, n_people : int
@@ -145,13 +143,15 @@ def plan_traffic(
     traffic : Traffic
         Who else is on the move.
     """
-    stamps = np.arange(drive.stamps_us[0], drive.stamps_us[-1] + STEP_US, STEP_US, dtype=np.int64)
+    stamps = np.arange(
+        trajectory.stamps_us[0], trajectory.stamps_us[-1] + TRACK_STEP_US, TRACK_STEP_US, dtype=np.int64
+    )
     seconds = (stamps - stamps[0]) * 1e-6
     n_oncoming = round(0.55 * n_vehicles)
     movers = _oncoming(route, seconds, n_oncoming, rng)
     n_same_way = min(2, n_vehicles - n_oncoming)
     for sign in (1.0, -1.0)[:n_same_way]:
-        movers.append(_same_way(route, drive, stamps, seconds, sign, rng))
+        movers.append(_same_way(route, trajectory, stamps, seconds, sign, rng))
     side_streets = [street for street in plan.streets if not street.on_loop]
     for _ in range(n_vehicles - n_oncoming - n_same_way):
         street = side_streets[int(rng.integers(len(side_streets)))]
@@ -167,8 +167,6 @@ def plan_traffic(
 
 
 def _draw_vehicle(rng: np.random.Generator) -> Mesh:
-    from rol_sim.world.vehicles import MOVING_KINDS, build_cyclist, build_vehicle, draw_kind
-
     return build_cyclist(rng) if rng.random() < 0.1 else build_vehicle(draw_kind(MOVING_KINDS, rng), rng)
 
 
@@ -193,18 +191,21 @@ def _oncoming(
 
 
 def _same_way(
-    route: Route, drive: Drive, stamps: np.ndarray, seconds: np.ndarray, sign: float, rng: np.random.Generator
+    route: Route,
+    trajectory: Trajectory,
+    stamps: np.ndarray,
+    seconds: np.ndarray,
+    sign: float,
+    rng: np.random.Generator,
 ) -> tuple[Mesh, np.ndarray]:
     """A vehicle ahead (+1) or behind (-1) in the car's own lane, 13 m away at least and ever farther."""
-    progress = np.interp(stamps - stamps[0], drive.stamps_us - stamps[0], drive.progress)
+    progress = np.interp(stamps - stamps[0], trajectory.stamps_us - stamps[0], trajectory.progress)
     gap = float(rng.uniform(13.0, 20.0)) + float(rng.uniform(0.1, 1.2)) * seconds
     poses = route.place(progress + sign * gap, route.lane_offset)
     return _draw_vehicle(rng), _unwrapped(poses, 0.0)
 
 
 def _on_foot(plan: StreetPlan, seconds: np.ndarray, rng: np.random.Generator) -> tuple[Mesh, np.ndarray]:
-    from rol_sim.world.vehicles import build_pedestrian
-
     street = plan.streets[int(rng.integers(len(plan.streets)))]
     side, length = 1 if rng.random() < 0.5 else -1, float(street.arc[-1])
     s = (

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from rol_sim.world.mesh import Material
+
 # Red, green, blue of each `mesh.Material` by name, between 0 and 1.
 PAINT = {
     "NONE": (0.86, 0.91, 0.96),
@@ -27,8 +29,6 @@ LIGHT = np.array([-0.35, 0.45, 0.82])  # unit vector to the sun
 
 def paint_table() -> np.ndarray:
     """Give the colour of every material, shape (n_materials, 3), grey where none is set."""
-    from rol_sim.world.mesh import Material
-
     table = np.full((max(Material) + 1, 3), 0.6)
     for material in Material:
         table[material] = PAINT.get(material.name, (0.6, 0.6, 0.6))

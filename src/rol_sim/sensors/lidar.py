@@ -9,15 +9,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from rol.geometry import check_fields
 from rol.oxford import ELEVATIONS_DOWN, FIRE_HEIGHT, RANGE_UNIT
-
-if TYPE_CHECKING:
-    from rol_sim.world.scene import Scene
+from rol_sim.world.mesh import Material
+from rol_sim.world.scene import Scene
 
 FIRING_US = 46.08  # time between two firings of the same laser
 FIRINGS_PER_PACKET = 12
@@ -101,8 +99,6 @@ class Sweep:
 @lru_cache
 def surface_table() -> np.ndarray:
     """Give the rows of `SURFACES` in the order of `Material`, shape (n_materials, 3)."""
-    from rol_sim.world.mesh import Material
-
     return np.array([SURFACES.get(m.name, (0.0, 1.0, 0.0)) for m in Material], dtype=np.float32)
 
 

@@ -12,18 +12,18 @@ row 0 looks 0.836 deg to the right of forward.
 from __future__ import annotations
 
 from dataclasses import dataclass, field, fields
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from rol.geometry import check_fields, check_poses
+from rol.oxford import COUNTS_PER_TURN, N_AZIMUTHS
+from rol_sim.sensors.radar_signal import echoes_to_codes, range_to_bins
+from rol_sim.sensors.radar_surfaces import Surface, SurfaceHits, scatter, surface_table
+from rol_sim.world.scene import Scene
 
-if TYPE_CHECKING:
-    from rol_sim.sensors.radar_surfaces import Surface
-    from rol_sim.world.scene import Scene
-
-N_AZIMUTHS, N_COUNTS, FIRST_COUNT, COUNT_STEP = 400, 5600, 13, 14
-ROW_ANGLE = 2.0 * np.pi * COUNT_STEP / N_COUNTS
+# Encoder counts of the rows: 13, 27, ... 5599 of 5600.
+FIRST_COUNT, COUNT_STEP = 13, 14
+ROW_ANGLE = 2.0 * np.pi * COUNT_STEP / COUNTS_PER_TURN
 MARGIN_ROWS = 5  # the beam's flanks reach this far before the first and after the last row
 WEAKEST_ONWARD = 3.0  # a ray is followed on while a perfect scatterer would return more power than this
 
@@ -45,12 +45,12 @@ class RadarSettings:
         Code of a perfect scatterer that fills the beam 10 m away.
     range_exponent : float
         Such a scatterer's power falls with range to this power.
-    haze_db, haze_length : float
+    clutter_tail_db, clutter_tail_m : float
         Every surface is followed by a haze of echoes that took a longer way (in through windows, between cars
         and walls): their mean power relative to the surface's [dB], and how far they reach on the mean [m].
     bounces : int
         How often a ray is mirrored on.
-    veil_layers : int
+    transmission_layers : int
         Through how many leaves a ray may pass.
     doppler_seconds : float
         Range shift per closing speed [s].
@@ -74,10 +74,10 @@ class RadarSettings:
     layer_gains_db: tuple[float, ...] = (-9.0, -1.0, -1.0, -9.0, -16.0, -19.0, -23.0, -27.0)
     gain_code: float = 109.5
     range_exponent: float = 0.0
-    haze_db: float = -17.0
-    haze_length: float = 4.0
+    clutter_tail_db: float = -17.0
+    clutter_tail_m: float = 4.0
     bounces: int = 3
-    veil_layers: int = 4
+    transmission_layers: int = 4
     doppler_seconds: float = 0.049
     max_range: float = 168.0
     noise_scale: float = 1.0
@@ -87,12 +87,12 @@ class RadarSettings:
 
     def __post_init__(self) -> None:
         allowed = {
-            "(0, inf)": "height layer_widths_deg haze_length max_range",
+            "(0, inf)": "height layer_widths_deg clutter_tail_m max_range",
             "[1, inf)": "rays_per_row",
             "[-90, 90]": "layers_deg",
-            "(-inf, inf)": "layer_gains_db range_exponent haze_db doppler_seconds",
+            "(-inf, inf)": "layer_gains_db range_exponent clutter_tail_db doppler_seconds",
             "[0, 255]": "gain_code",
-            "[0, inf)": "bounces veil_layers noise_scale streak_scale interference_rate",
+            "[0, inf)": "bounces transmission_layers noise_scale streak_scale interference_rate",
         }
         check_fields(self, allowed)
 
@@ -137,7 +137,7 @@ def beam_azimuths() -> np.ndarray:
         Counter-clockwise from forward, falling from -0.015 to -6.28 [rad]; the sensor's counters are 13, 27,
         ... 5599.
     """
-    return -2.0 * np.pi * (FIRST_COUNT + COUNT_STEP * np.arange(N_AZIMUTHS)) / N_COUNTS
+    return -2.0 * np.pi * (FIRST_COUNT + COUNT_STEP * np.arange(N_AZIMUTHS)) / COUNTS_PER_TURN
 
 
 def simulate_scan(
@@ -175,8 +175,6 @@ def simulate_scan(
     ValueError
         If poses or velocities do not have 400 rows of finite numbers.
     """
-    from rol_sim.sensors.radar_signal import echoes_to_codes, range_to_bins
-
     settings = settings or RadarSettings()
     row_poses, velocities = check_poses(row_poses, "row_poses"), np.asarray(row_velocities, dtype=np.float64)
     if row_poses.shape != (N_AZIMUTHS, 3):
@@ -190,9 +188,14 @@ def simulate_scan(
         closing = closing - _look_up_velocities(objects, object_velocities)
     ranges = ranges - settings.doppler_seconds * np.einsum("ij,ij->i", closing, headings)
     return echoes_to_codes(
-        rows, range_to_bins(ranges), powers, rng, noise_scale=settings.noise_scale,
-        streak_scale=settings.streak_scale, interference_rate=settings.interference_rate,
-    )  # fmt: skip
+        rows,
+        range_to_bins(ranges),
+        powers,
+        rng,
+        noise_scale=settings.noise_scale,
+        streak_scale=settings.streak_scale,
+        interference_rate=settings.interference_rate,
+    )
 
 
 def emit_rays(row_poses: np.ndarray, rng: np.random.Generator, settings: RadarSettings) -> Rays:
@@ -219,7 +222,7 @@ def emit_rays(row_poses: np.ndarray, rng: np.random.Generator, settings: RadarSe
     elevations = np.deg2rad(np.array(settings.layers_deg) + (jitter[1] - 0.5) * settings.layer_widths_deg)
     at, knots = np.clip(rows, 0.0, N_AZIMUTHS - 1.0), np.arange(N_AZIMUTHS)
     x, y, yaw = (np.interp(at, knots, values) for values in (*row_poses[:, :2].T, np.unwrap(row_poses[:, 2])))
-    angle = yaw - (FIRST_COUNT + COUNT_STEP * rows) * 2.0 * np.pi / N_COUNTS
+    angle = yaw - (FIRST_COUNT + COUNT_STEP * rows) * 2.0 * np.pi / COUNTS_PER_TURN
     flat = np.cos(elevations)
     direction = np.stack([flat * np.cos(angle), flat * np.sin(angle), np.sin(elevations)], axis=-1)
     gains = 10.0 ** (np.array(settings.layer_gains_db) / 10.0) * settings.layer_widths_deg
@@ -258,52 +261,59 @@ def trace_echoes(scene: Scene, rays: Rays, settings: RadarSettings) -> tuple[np.
     objects : array, shape (n,)
         Object number.
     """
-    from rol_sim.sensors.radar_surfaces import scatter, surface_table
-
     table, found = surface_table(settings.surfaces), []
-    spacing, haze = ROW_ANGLE / settings.rays_per_row, 10.0 ** (settings.haze_db / 10.0)
-    for _ in range(settings.veil_layers + settings.bounces):
-        hits = scene.cast(np.concatenate([rays.origin, rays.direction], axis=1))
-        near = np.flatnonzero(rays.length + hits.t < settings.max_range)
-        rays, t, normals, surfaces = (
-            rays.take(near),
-            hits.t[near],
-            hits.normals[near],
-            table[hits.material[near]],
-        )
-        objects, cosines = hits.object_id[near], hits.cos_incidence[near]
-        points, totals = rays.origin + t[:, None] * rays.direction, rays.length + t
-        weights = rays.weight * (totals / 10.0) ** np.float32(-settings.range_exponent)
-        turns, ranges, powers, sources = scatter(
-            points, rays.direction, normals, cosines, objects, surfaces, rays.heading, totals, weights,
-            rays.bounced == 0, spacing, haze, settings.haze_length,
-        )  # fmt: skip
-        rows = rays.row[sources] - turns / np.float32(ROW_ANGLE)
-        found.append((rows, ranges, powers, rays.heading[sources, :2], objects[sources]))
-        rays = _go_on(rays, points, totals, weights, normals, surfaces, settings.bounces)
+    ray_spacing = ROW_ANGLE / settings.rays_per_row
+    tail_fraction = 10.0 ** (settings.clutter_tail_db / 10.0)
+    for _ in range(settings.transmission_layers + settings.bounces):
+        rays, hits = _hit_surfaces(scene, rays, table, settings)
+        echoes = scatter(hits, ray_spacing, tail_fraction, settings.clutter_tail_m)
+        source = echoes.sources
+        rows = rays.row[source] - echoes.turns / np.float32(ROW_ANGLE)
+        found.append((rows, echoes.ranges, echoes.powers, rays.heading[source, :2], hits.objects[source]))
+        rays = _follow_rays(rays, hits, settings.bounces)
         if len(rays.row) == 0:
             break
     rows, ranges, powers, headings, objects = (np.concatenate(parts) for parts in zip(*found, strict=True))
     return rows, ranges, powers, headings / np.linalg.norm(headings, axis=1, keepdims=True), objects
 
 
-def _go_on(
-    rays: Rays, points: np.ndarray, totals: np.ndarray, weights: np.ndarray, normals: np.ndarray,
-    surfaces: np.ndarray, bounces: int,
-) -> Rays:  # fmt: skip
-    """Rays that pass through leaves or glass, and mirrored ones; the rest ends."""
-    mirror, passes, strong = surfaces[:, 6], surfaces[:, 7], weights > WEAKEST_ONWARD
+def _hit_surfaces(
+    scene: Scene, rays: Rays, table: np.ndarray, settings: RadarSettings
+) -> tuple[Rays, SurfaceHits]:
+    """Cast rays; returns those that hit something within range, and their hits."""
+    found = scene.cast(np.concatenate([rays.origin, rays.direction], axis=1))
+    near = np.flatnonzero(rays.length + found.t < settings.max_range)
+    rays, t = rays.take(near), found.t[near]
+    ranges = rays.length + t
+    return rays, SurfaceHits(
+        points=rays.origin + t[:, None] * rays.direction,
+        directions=rays.direction,
+        normals=found.normals[near],
+        cosines=found.cos_incidence[near],
+        objects=found.object_id[near],
+        surfaces=table[found.material[near]],
+        headings=rays.heading,
+        ranges=ranges,
+        weights=rays.weight * (ranges / 10.0) ** np.float32(-settings.range_exponent),
+        is_direct=rays.bounced == 0,
+    )
+
+
+def _follow_rays(rays: Rays, hits: SurfaceHits, bounces: int) -> Rays:
+    """Continue rays behind leaves and glass, and mirrored ones; the rest ends."""
+    mirror, passes, strong = hits.surfaces[:, 6], hits.surfaces[:, 7], hits.weights > WEAKEST_ONWARD
+    is_upright = np.abs(hits.normals[:, 2]) < 0.3
     through = np.flatnonzero((passes > 0.0) & strong)
-    back = np.flatnonzero((mirror > 0.0) & strong & (rays.bounced < bounces) & (np.abs(normals[:, 2]) < 0.3))
-    along = np.einsum("ij,ij->i", rays.direction[back], normals[back])
-    turned = rays.direction[back] - 2.0 * along[:, None] * normals[back]
-    onward = rays.take(np.concatenate([through, back]))
-    onward.direction = np.concatenate([rays.direction[through], turned])
-    onward.origin = points[np.concatenate([through, back])] + np.float32(0.02) * onward.direction
-    onward.length = totals[np.concatenate([through, back])]
-    onward.weight *= (
-        np.concatenate([passes[through], mirror[back]]) ** 2
-    )  # lost on the way out and on the way back
+    back = np.flatnonzero((mirror > 0.0) & strong & (rays.bounced < bounces) & is_upright)
+    along = np.einsum("ij,ij->i", rays.direction[back], hits.normals[back])
+    mirrored = rays.direction[back] - 2.0 * along[:, None] * hits.normals[back]
+    both = np.concatenate([through, back])
+    onward = rays.take(both)
+    onward.direction = np.concatenate([rays.direction[through], mirrored])
+    onward.origin = hits.points[both] + np.float32(0.02) * onward.direction
+    onward.length = hits.ranges[both]
+    # Power is lost on the way out and on the way back.
+    onward.weight *= np.concatenate([passes[through], mirror[back]]) ** 2
     onward.bounced[len(through) :] += 1
     return onward
 

@@ -9,6 +9,9 @@ from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
+import yaml
+
+from rol.files import read_text
 from rol.geometry import check_fields
 
 SWEEPS = ("nearest", "all", "none")
@@ -224,10 +227,6 @@ def load_settings(path: Path | str) -> SimulationSettings:
     SettingsError
         If the file cannot be read, has no such section, or a setting is at fault.
     """
-    import yaml
-
-    from rol.files import read_text
-
     try:
         content = yaml.safe_load(read_text(path))
     except (OSError, ValueError, yaml.YAMLError) as error:
@@ -255,8 +254,6 @@ def read_settings(path: Path | str) -> SimulationSettings:
     SettingsError
         If the file cannot be read or a setting is at fault.
     """
-    from rol.files import read_text
-
     path = Path(path)
     try:
         values = json.loads(read_text(path))

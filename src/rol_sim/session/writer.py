@@ -16,20 +16,29 @@ from concurrent.futures import ProcessPoolExecutor, as_completed
 from itertools import pairwise
 from pathlib import Path
 from time import perf_counter
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import cv2
 import numpy as np
 
-from rol.oxford import RadarOdometry, VelodyneRaw
-from rol_sim.session import oxford_files
-
-if TYPE_CHECKING:
-    from rol_sim.session.assembly import SimulatedSession
-    from rol_sim.session.settings import SimulationSettings
+from rol.evaluation import write_tum
+from rol.files import is_used, read_marker, write_bytes, write_text
+from rol.oxford import LIDARS, RadarOdometry, VelodyneRaw
+from rol_sim.session import logs, oxford_files
+from rol_sim.session.settings import SimulationSettings, describe
+from rol_sim.session.simulation import (
+    GPS,
+    INS,
+    ODOMETRY,
+    SimulatedSession,
+    build_session,
+    make_scan,
+    make_sweep,
+    sensor_settings,
+)
 
 SCAN_BYTES, SWEEP_BYTES = 470_000, 65_000  # what a file takes on the mean
 FORMAT = 4  # raise it when the same settings give other files
-LIDARS = ("velodyne_left", "velodyne_right")
 _MADE = (
     "session.json",
     "truth.tum",
@@ -80,15 +89,12 @@ def write_session(
     OSError
         If the disk has not the room that the session needs, or is full.
     """
-    from rol_sim.session.assembly import build_session, sensor_settings
-    from rol_sim.session.settings import describe
-
     sensor_settings(settings)  # faults are told before anything is built
     folder = Path(root) / name
     if not _prepare_folder(folder, {"format": FORMAT, **describe(settings, name)}, report):
         return folder
     session = build_session(settings, name)
-    report(f"{name}: {check_room(folder, session)}")
+    report(f"{name}: {check_disk_space(folder, session)}")
     n = len(session.scans_us)
     edges = np.unique(np.linspace(0, n, min(n, max(20, n // 50)) + 1).astype(int)).tolist()
     begin = perf_counter()
@@ -101,7 +107,7 @@ def write_session(
     return folder
 
 
-def check_room(folder: Path, session: SimulatedSession) -> str:
+def check_disk_space(folder: Path, session: SimulatedSession) -> str:
     """Say how much will be written, and refuse if the disk has not the room.
 
     Parameters
@@ -162,8 +168,6 @@ _worker: tuple[Path, SimulatedSession] | None = None
 
 def _open_worker(folder: Path, settings: SimulationSettings, name: str) -> None:
     """Build the session once in each process."""
-    from rol_sim.session.assembly import build_session
-
     global _worker
     _worker = folder, build_session(settings, name)
 
@@ -188,8 +192,6 @@ def _write_stretch(folder: Path, session: SimulatedSession, first: int, end: int
 
 def _prepare_folder(folder: Path, wanted: dict[str, Any], report: Callable[[str], None]) -> bool:
     """Make the folder fit for these settings; False if the session in it is complete."""
-    from rol.files import is_used, read_marker
-
     path, wanted = folder / "settings.json", json.loads(json.dumps(wanted))
     found = read_marker(path)
     if not {"format", "session"} <= found.keys() and is_used(folder):
@@ -218,16 +220,12 @@ def _prepare_folder(folder: Path, wanted: dict[str, Any], report: Callable[[str]
 
 
 def _write_scan(folder: Path, session: SimulatedSession, index: int) -> None:
-    from rol_sim.session.assembly import make_scan
-
     path = folder / "radar" / f"{session.scans_us[index]}.png"
     if not path.exists():
         oxford_files.save_radar(path, make_scan(session, index))
 
 
 def _write_sweep(folder: Path, session: SimulatedSession, sensor: str, place: int, index: int) -> None:
-    from rol_sim.session.assembly import make_sweep
-
     (folder / sensor).mkdir(exist_ok=True)
     stamp, every = int(session.sweeps_us[sensor][index]), session.settings.labels_every
     path = folder / sensor / f"{stamp}.png"
@@ -244,10 +242,6 @@ def _write_sweep(folder: Path, session: SimulatedSession, sensor: str, place: in
 
 def _write_logs(folder: Path, session: SimulatedSession) -> None:
     """Everything but scans and sweeps; session.json last."""
-    from rol.evaluation import write_tum
-    from rol_sim.session import logs
-    from rol_sim.session.assembly import GPS, INS, ODOMETRY
-
     scans, middles, settings = session.scans_us, session.scans_us + session.turns_us // 2, session.settings
     oxford_files.save_timestamps(folder / "radar.timestamps", scans)
     for sensor in LIDARS:
@@ -256,7 +250,7 @@ def _write_logs(folder: Path, session: SimulatedSession) -> None:
         ):  # a session without sweeps looks like one whose lidars were not fetched
             chosen = session.sweeps_us[sensor][session.chosen[sensor]]
             oxford_files.save_timestamps(folder / f"{sensor}.timestamps", chosen)
-    truth = session.drive.pose(middles)
+    truth = session.trajectory.pose(middles)
     steps = np.zeros((len(scans) - 2, 6))  # as in the data set, the last scan has no pose
     steps[:, [0, 1, 5]] = logs.drift_odometry(
         truth[:-1],
@@ -268,19 +262,22 @@ def _write_logs(folder: Path, session: SimulatedSession) -> None:
         folder / "gt" / "radar_odometry.csv",
         RadarOdometry(middles[1:-1], middles[:-2], scans[1:-1], scans[:-2], steps),
     )
-    oxford_files.save_gps(folder / "gps" / "gps.csv", logs.draw_gps(session.drive, session.generator(GPS)))
-    oxford_files.save_ins(folder / "gps" / "ins.csv", logs.draw_ins(session.drive, session.generator(INS)))
+    oxford_files.save_gps(
+        folder / "gps" / "gps.csv", logs.draw_gps(session.trajectory, session.generator(GPS))
+    )
+    oxford_files.save_ins(
+        folder / "gps" / "ins.csv", logs.draw_ins(session.trajectory, session.generator(INS))
+    )
     write_tum(folder / "truth.tum", scans, truth)
     _write_json(folder / "session.json", _summarise(session, truth))
 
 
 def _summarise(session: SimulatedSession, truth: np.ndarray) -> dict[str, Any]:
-    from rol_sim.session.settings import describe
-
     way = np.interp(
-        [session.scans_us[0], session.scans_us[-1] + session.turns_us[-1]], session.drive.stamps_us,
-        np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(session.drive.poses[:, :2], axis=0).T))]),
-    )  # fmt: skip
+        [session.scans_us[0], session.scans_us[-1] + session.turns_us[-1]],
+        session.trajectory.stamps_us,
+        np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(session.trajectory.poses[:, :2], axis=0).T))]),
+    )
     duration = float(session.scans_us[-1] + session.turns_us[-1] - session.scans_us[0]) * 1e-6
     return {
         "name": session.name,
@@ -297,14 +294,8 @@ def _summarise(session: SimulatedSession, truth: np.ndarray) -> dict[str, Any]:
 
 
 def _write_json(path: Path, values: dict[str, Any]) -> None:
-    from rol.files import write_text
-
     write_text(path, json.dumps(values, indent=2) + "\n")
 
 
 def _write_image(path: Path, image: np.ndarray) -> None:
-    import cv2
-
-    from rol.files import write_bytes
-
     write_bytes(path, cv2.imencode(".png", image)[1].tobytes())

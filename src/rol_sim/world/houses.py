@@ -6,20 +6,18 @@ A footprint is a row (x, y, yaw, half length, half width) of a rectangle in the 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from rol.geometry import compose, transform_points
-
-if TYPE_CHECKING:
-    from rol_sim.world.mesh import Mesh
-    from rol_sim.world.streets import Street, StreetPlan
+from rol_sim.world.mesh import Material, Mesh, move_mesh
+from rol_sim.world.shapes import build_block, build_house, build_railing, build_wall
+from rol_sim.world.streets import Street, StreetPlan
 
 
 @dataclass
 class Builder:
-    """Collects what has been built: meshes, footprints, and the plants and driveways that sessions dress.
+    """Collects what has been built: meshes, footprints, and the plants and driveways that sessions add.
 
     Attributes
     ----------
@@ -43,8 +41,6 @@ class Builder:
 
     def add(self, mesh: Mesh, pose: np.ndarray, sink: float = 0.0) -> None:
         """Set a body down on the land."""
-        from rol_sim.world.mesh import move_mesh
-
         z = float(self.plan.ground(np.asarray(pose)[None, :2])[0]) - sink
         self.meshes.append(move_mesh(mesh, pose, z, object_id=len(self.meshes)))
 
@@ -146,8 +142,6 @@ def _build_plot(
     setback: float,
     rng: np.random.Generator,
 ) -> bool:
-    from rol_sim.world.shapes import build_house
-
     depth = float(rng.uniform(7.0, 11.0))
     height = float(
         rng.choice([4.9, 5.6, 7.8, 8.8, 11.0], p=[0.25, 0.35, 0.2, 0.12, 0.08]) + rng.uniform(-0.4, 0.4)
@@ -203,9 +197,6 @@ def _add_barrier(
 def _add_piece(
     builder: Builder, start: np.ndarray, length: float, height: float, rng: np.random.Generator
 ) -> None:
-    from rol_sim.world.mesh import Material
-    from rol_sim.world.shapes import build_railing, build_wall
-
     kind = str(rng.choice(["wall", "hedge", "railing"], p=[0.5, 0.35, 0.15]))
     middle = compose(start, np.array([0.5 * length, 0.0, 0.0]))
     if not builder.is_free(np.array([*middle, 0.5 * length, 0.1]), builder.plan.pavement_width - 0.6):
@@ -236,33 +227,29 @@ def build_landmarks(builder: Builder, rng: np.random.Generator) -> np.ndarray:
     green : array, shape (5,)
         Footprint of the green.
     """
-    from rol_sim.world.shapes import build_block
-
-    church = find_room(builder, 13.0, 6.0, 6.0, 14.0, rng)
+    church = find_free_plot(builder, 13.0, 6.0, 6.0, 14.0, rng)
     if church is not None:
         builder.add(build_block(-13.0, 6.0, -6.0, 6.0, 9.0, 5.0, windows=4.0), church[:3], sink=0.2)
         builder.add(build_block(6.0, 13.0, -3.5, 3.5, 21.0, 0.0, windows=3.5), church[:3], sink=0.2)
     for a, b, height in ((16.0, 9.0, 7.0), (12.0, 10.0, 12.0)):
-        hall = find_room(builder, a, b, 4.0, 12.0, rng)
+        hall = find_free_plot(builder, a, b, 4.0, 12.0, rng)
         if hall is not None:
             builder.add(build_block(-a, a, -b, b, height, 0.0, windows=3.5), hall[:3], sink=0.2)
-    green = find_room(builder, 17.0, 12.0, 2.2, 4.5, rng)
+    green = find_free_plot(builder, 17.0, 12.0, 2.2, 4.5, rng)
     return np.zeros(5) if green is None else green
 
 
 def build_sheds(builder: Builder, count: int, rng: np.random.Generator) -> None:
     """Fill back yards and the outskirts with sheds, garages and houses off the street; fills the builder."""
-    from rol_sim.world.shapes import build_block
-
     for _ in range(count):
         a, b = float(rng.uniform(1.5, 6.0)), float(rng.uniform(1.5, 4.0))
-        place = find_room(builder, a, b, 9.0, 60.0, rng, tries=6)
+        place = find_free_plot(builder, a, b, 9.0, 60.0, rng, tries=6)
         if place is not None:
             height = float(rng.uniform(2.2, 3.2) if a * b < 12.0 else rng.uniform(4.0, 8.0))
             builder.add(build_block(-a, a, -b, b, height, float(rng.uniform(0.0, 2.0))), place[:3], sink=0.2)
 
 
-def find_room(
+def find_free_plot(
     builder: Builder,
     a: float,
     b: float,

@@ -10,16 +10,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass, fields
 from enum import IntEnum
-from typing import TYPE_CHECKING
 
 import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from rol.compiled import compiled
 from rol.geometry import check_grid
-
-if TYPE_CHECKING:
-    from rol_sim.world.mesh import Mesh
+from rol_sim.world.mesh import Material, Mesh, make_mesh, merge_meshes
 
 LINK_M = 0.8  # cells nearer than this belong together ...
 ROW_LINK_M, ROW_BEND = (
@@ -182,9 +181,6 @@ def _fit_strips(points, order, cell_of, starts, reach, half, ways):  # pragma: n
 
 def _link(points: np.ndarray, headings: np.ndarray, is_straight: np.ndarray) -> np.ndarray:
     """Number the connected groups: cells of straight rows that go the same way, and the rest."""
-    from scipy.sparse import coo_array
-    from scipy.sparse.csgraph import connected_components
-
     a, b = cKDTree(points).query_pairs(ROW_LINK_M, output_type="ndarray").T
     same_way = np.abs(np.sin(headings[a] - headings[b])) < np.sin(ROW_BEND)
     near = np.hypot(*(points[a] - points[b]).T) < LINK_M
@@ -269,9 +265,7 @@ def draw_unmapped(cells: Cells, rng: np.random.Generator, *, share: float = 0.1)
 
 def join_cells(first: Cells, second: Cells) -> Cells:
     """Put two sets of cells into one; their group numbers are kept."""
-    return Cells(*(
-        np.concatenate([getattr(first, f.name), getattr(second, f.name)]) for f in fields(Cells)
-    ))  # fmt: skip
+    return Cells(*(np.concatenate([getattr(first, f.name), getattr(second, f.name)]) for f in fields(Cells)))
 
 
 def build_pieces(cells: Cells, seed: int, *, leaf_density: float = 1.0) -> Mesh:
@@ -292,12 +286,13 @@ def build_pieces(cells: Cells, seed: int, *, leaf_density: float = 1.0) -> Mesh:
         FACADE 4 to 9 m and WALL 1.3 to 2.8 m high, TREE_CROWN flakes above a HEDGE-like foot, METAL poles,
         VEHICLE faces; the object number is that of the group.
     """
-    from rol_sim.world.mesh import merge_meshes
-
     builders = {
-        Kind.FACADE: _build_rows, Kind.WALL: _build_rows, Kind.PLANT: _build_plants, Kind.POLE: _build_poles,
+        Kind.FACADE: _build_rows,
+        Kind.WALL: _build_rows,
+        Kind.PLANT: _build_plants,
+        Kind.POLE: _build_poles,
         Kind.VEHICLE: _build_vehicle_sides,
-    }  # fmt: skip
+    }
     meshes = []
     for kind, build in builders.items():
         own = cells.take(np.flatnonzero(cells.kinds == kind))
@@ -323,8 +318,6 @@ def _cell_numbers(points: np.ndarray) -> np.ndarray:
 
 def _build_rows(cells: Cells, kind: Kind, seed: int, leaf_density: float) -> Mesh:
     """Upright strips along the row; neighbours overlap, so that a row of cells is closed."""
-    from rol_sim.world.mesh import Material
-
     low, high = (4.0, 9.0) if kind == Kind.FACADE else (1.3, 2.8)
     top = low + (high - low) * _draw(cells.groups, seed, 1)
     material = Material.FACADE if kind == Kind.FACADE else Material.WALL
@@ -332,16 +325,12 @@ def _build_rows(cells: Cells, kind: Kind, seed: int, leaf_density: float) -> Mes
 
 
 def _build_vehicle_sides(cells: Cells, kind: Kind, seed: int, leaf_density: float) -> Mesh:
-    from rol_sim.world.mesh import Material
-
     top = 1.4 + 0.8 * _draw(cells.groups, seed, 2) ** 3
     return _build_strips(cells.points, cells.headings, 0.25, 0.2, top, Material.VEHICLE, cells.groups)
 
 
 def _build_poles(cells: Cells, kind: Kind, seed: int, leaf_density: float) -> Mesh:
     """Two crossed strips: a slim pole that is seen from all sides."""
-    from rol_sim.world.mesh import Material, merge_meshes
-
     radius = 0.04 + 0.08 * _draw(cells.groups, seed, 3)
     top = 1.0 + 5.0 * _draw(cells.groups, seed, 4)
     turn = np.pi * _draw(cells.groups, seed, 5)
@@ -354,8 +343,6 @@ def _build_poles(cells: Cells, kind: Kind, seed: int, leaf_density: float) -> Me
 
 def _build_plants(cells: Cells, kind: Kind, seed: int, leaf_density: float) -> Mesh:
     """Flakes of leaves, up to two for every metre of height, turned at random."""
-    from rol_sim.world.mesh import Material, merge_meshes
-
     numbers = _cell_numbers(cells.points)
     height = 0.8 + 4.5 * _draw(cells.groups, seed, 6) * _draw(numbers, seed, 7)
     meshes = []
@@ -386,16 +373,19 @@ def _build_strips(
     groups: np.ndarray,
 ) -> Mesh:
     """Upright rectangles, `half` to both sides of each point along its heading, from `low` to `high` [m]."""
-    from rol_sim.world.mesh import make_mesh
-
     n = len(points)
     step = np.broadcast_to(half, n)[:, None] * np.column_stack([np.cos(headings), np.sin(headings)])
     low, high = np.broadcast_to(low, n), np.broadcast_to(high, n)
     left, right = points - step, points + step
-    corners = np.stack([
-        np.column_stack([left, low]), np.column_stack([right, low]),
-        np.column_stack([right, high]), np.column_stack([left, high]),
-    ], axis=1)  # fmt: skip
+    corners = np.stack(
+        [
+            np.column_stack([left, low]),
+            np.column_stack([right, low]),
+            np.column_stack([right, high]),
+            np.column_stack([left, high]),
+        ],
+        axis=1,
+    )
     first = 4 * np.arange(n)[:, None]
     triangles = np.stack([first + (0, 1, 2), first + (0, 2, 3)], axis=1)
     return make_mesh(corners.reshape(-1, 3), triangles.reshape(-1, 3), material, np.repeat(groups, 2))
@@ -407,7 +397,7 @@ def build_ground(places: np.ndarray, radius: float, object_id: int = -2) -> Mesh
     Parameters
     ----------
     places : array, shape (m, 2)
-        Places, such as the poses of a drive [m].
+        Places, such as the poses of a trajectory [m].
     radius : float
         How far the ground reaches [m].
     object_id : int
@@ -418,8 +408,6 @@ def build_ground(places: np.ndarray, radius: float, object_id: int = -2) -> Mesh
     mesh : Mesh
         GROUND at z = 0.
     """
-    from rol_sim.world.mesh import Material, make_mesh
-
     side, reach = GROUND_TILE_M, int(np.ceil(radius / GROUND_TILE_M))
     tiles = np.unique(np.floor(np.asarray(places)[:, :2] / side).astype(np.int64), axis=0)
     around = np.stack(np.meshgrid(*[np.arange(-reach, reach + 1)] * 2, indexing="ij"), -1).reshape(-1, 2)

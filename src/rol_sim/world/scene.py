@@ -1,4 +1,4 @@
-"""The town as rays see it: first hits and all hits, by Open3D's ray casting scene (Embree).
+"""Ray casting in the simulated world: the first hit of every ray, by Open3D's ray casting scene (Embree).
 
 A `Scene` holds the big standing town and, apart from it, the few moving vehicles. `Scene.with_moving`
 exchanges only the latter, which takes about a millisecond, while the search structure of the town is shared.
@@ -13,11 +13,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-os.environ.setdefault("OPEN3D_DISABLE_WEB_VISUALIZER", "true")  # or else it talks into every notebook
-import open3d as o3d
+from rol_sim.world.mesh import Mesh, merge_meshes
 
 if TYPE_CHECKING:
-    from rol_sim.world.mesh import Mesh
+    from open3d.core import Tensor
+
+# Without it Open3D prints into every notebook.
+os.environ.setdefault("OPEN3D_DISABLE_WEB_VISUALIZER", "true")
 
 
 @dataclass(frozen=True)
@@ -45,53 +47,23 @@ class Hits:
     cos_incidence: np.ndarray
 
 
-@dataclass(frozen=True)
-class Intersections:
-    """All crossings of rays with surfaces, sorted by ray and then by distance.
-
-    Attributes
-    ----------
-    ray_index : array, shape (m,), int64
-        Which ray.
-    t : array, shape (m,), float32
-        Distance along the ray in lengths of its direction vector.
-    material : array, shape (m,), uint8
-        `Material` of the surface.
-    cos_incidence : array, shape (m,), float32
-        Cosine between ray and normal, without sign: 0 (grazing) .. 1 (head-on).
-    normals : array, shape (m, 3), float32
-        Unit normal on the side the ray came from.
-    object_id : array, shape (m,), int32
-        Object number.
-    """
-
-    ray_index: np.ndarray
-    t: np.ndarray
-    material: np.ndarray
-    cos_incidence: np.ndarray
-    normals: np.ndarray
-    object_id: np.ndarray
-
-
 class _Part:
     """One mesh with its search structure."""
 
     def __init__(self, mesh: Mesh, threads: int) -> None:
+        import open3d as o3d
+
         self.mesh, self.normals, self.threads = mesh, mesh.normals, threads
         self.caster = o3d.t.geometry.RaycastingScene(nthreads=threads)
         self.caster.add_triangles(o3d.core.Tensor(mesh.vertices), o3d.core.Tensor(mesh.triangles))
 
-    def first_hits(self, rays: o3d.core.Tensor) -> tuple[np.ndarray, np.ndarray]:
+    def first_hits(self, rays: Tensor) -> tuple[np.ndarray, np.ndarray]:
         found = self.caster.cast_rays(rays, nthreads=self.threads)
         return found["t_hit"].numpy(), found["primitive_ids"].numpy()
 
-    def all_hits(self, rays: o3d.core.Tensor) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        found = self.caster.list_intersections(rays, nthreads=self.threads)
-        return tuple(found[key].numpy() for key in ("ray_ids", "t_hit", "primitive_ids"))
-
 
 class Scene:
-    """A standing town and moving vehicles, to be asked by rays.
+    """Static world and moving bodies, for ray casting.
 
     Parameters
     ----------
@@ -164,44 +136,14 @@ class Scene:
         normals, cos_incidence = _face_origin(normals, rays[:, 3:])
         return Hits(t, material, normals, object_id, cos_incidence)
 
-    def cast_through(self, rays: np.ndarray, max_t: float = np.inf) -> Intersections:
-        """Find every surface on every ray, also those behind the first.
-
-        Parameters
-        ----------
-        rays : array, shape (n, 6), float32
-            Origin and direction of every ray in the world frame [m].
-        max_t : float
-            Crossings farther than this are left out.
-
-        Returns
-        -------
-        intersections : Intersections
-            Sorted by ray, then by distance.
-        """
-        rays, tensor = _as_rays(rays)
-        columns: list[tuple[np.ndarray, ...]] = []
-        for part in self._parts:
-            ray, t, triangle = part.all_hits(tensor)
-            near = np.flatnonzero(t <= max_t)
-            ray, t, triangle = ray[near].astype(np.int64), t[near], triangle[near]
-            columns.append(
-                (ray, t, part.mesh.materials[triangle], part.normals[triangle], part.mesh.objects[triangle])
-            )
-        ray, t, material, normals, object_id = (np.concatenate(c) for c in zip(*columns, strict=True))
-        order = _order_by_ray_and_distance(ray, t)
-        ray, t = ray[order], t[order]
-        normals, cos_incidence = _face_origin(normals[order], rays[ray, 3:])
-        return Intersections(ray, t, material[order], cos_incidence, normals, object_id[order])
-
 
 def _as_one(meshes: Mesh | Sequence[Mesh]) -> Mesh:
-    from rol_sim.world.mesh import Mesh, merge_meshes
-
     return meshes if isinstance(meshes, Mesh) else merge_meshes(list(meshes))
 
 
-def _as_rays(rays: np.ndarray) -> tuple[np.ndarray, o3d.core.Tensor]:
+def _as_rays(rays: np.ndarray) -> tuple[np.ndarray, Tensor]:
+    import open3d as o3d
+
     rays = np.ascontiguousarray(rays, dtype=np.float32)
     if rays.ndim != 2 or rays.shape[1] != 6:
         raise ValueError(f"rays: expected shape (n, 6) for origin and direction, got {rays.shape}")
@@ -214,18 +156,3 @@ def _face_origin(normals: np.ndarray, directions: np.ndarray) -> tuple[np.ndarra
     length = np.sqrt(np.einsum("ij,ij->i", directions, directions))
     cos_incidence = np.abs(along) / np.maximum(length, 1e-12)
     return np.where(along[:, None] > 0, -normals, normals), np.minimum(cos_incidence, 1.0).astype(np.float32)
-
-
-def _order_by_ray_and_distance(ray: np.ndarray, t: np.ndarray) -> np.ndarray:
-    # Floats of one sign sort like their bits, so ray and distance fit into one integer key.
-    key = (ray.astype(np.uint64) << np.uint64(32)) | np.maximum(t, 0).astype(np.float32).view(np.uint32)
-    return np.argsort(key, kind="stable")
-
-
-def __getattr__(name: str) -> object:
-    """Hand on what the meshes' room holds, so that who casts rays needs one import."""
-    from rol_sim.world import mesh
-
-    if name in ("GROUND_MATERIALS", "MATERIALS", "Material", "Mesh", "make_mesh", "merge_meshes"):
-        return getattr(mesh, name)
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -7,12 +7,9 @@ down in the town.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
-if TYPE_CHECKING:
-    from rol_sim.world.mesh import Mesh
+from rol_sim.world.mesh import Material, Mesh, make_mesh, merge_meshes
 
 
 def build_quads(corners: np.ndarray, material: np.ndarray | int) -> Mesh:
@@ -30,8 +27,6 @@ def build_quads(corners: np.ndarray, material: np.ndarray | int) -> Mesh:
     mesh : Mesh
         2 n triangles.
     """
-    from rol_sim.world.mesh import make_mesh
-
     corners = np.asarray(corners, dtype=np.float64).reshape(-1, 4, 3)
     first = 4 * np.arange(len(corners))[:, None]
     triangles = np.stack([first + (0, 1, 2), first + (0, 2, 3)], axis=1)
@@ -51,8 +46,6 @@ def build_cylinder(
     radius: float, z0: float, z1: float, material: int, sides: int = 8, lean: float = 0.0
 ) -> Mesh:
     """Make an upright pole with a lid; `lean` moves its top forward [m]."""
-    from rol_sim.world.mesh import make_mesh, merge_meshes
-
     angle = 2.0 * np.pi * np.arange(sides + 1) / sides
     foot = np.stack([radius * np.cos(angle), radius * np.sin(angle), np.full(sides + 1, z0)], axis=1)
     top = foot + (lean, 0.0, z1 - z0)
@@ -85,8 +78,6 @@ def lay_facade(
     materials : array, shape (n,)
         FACADE or GLASS.
     """
-    from rol_sim.world.mesh import Material
-
     start, end = np.asarray(start, dtype=float), np.asarray(end, dtype=float)
     length = float(np.hypot(*(end - start)))
     along = (end - start) / max(length, 1e-9)
@@ -141,8 +132,6 @@ def build_block(
     mesh : Mesh
         The body, standing 1 m deep in the ground.
     """
-    from rol_sim.world.mesh import Material
-
     front, side = max(1, int((x1 - x0) / windows)), int((y1 - y0) / (2.5 * windows))
     foot = np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1]])
     walls = [
@@ -174,8 +163,6 @@ def build_house(width: float, depth: float, height: float, rng: np.random.Genera
     mesh : Mesh
         The house; it reaches from y = +1.2 (bay) to y = -depth - 3 (rear wing) at most.
     """
-    from rol_sim.world.mesh import Material, merge_meshes
-
     half, rise = 0.5 * width, float(rng.uniform(1.5, 3.5)) if rng.random() < 0.8 else 0.0
     parts, split = [], half
     if width > 8.0 and rng.random() < 0.45:  # a part of the front stands back
@@ -214,8 +201,6 @@ def build_wall(length: float, height: float, thickness: float, material: int) ->
 
 def build_railing(length: float, height: float) -> Mesh:
     """Make an iron railing from the origin along x: bars every 0.25 m and two rails [m]."""
-    from rol_sim.world.mesh import Material, merge_meshes
-
     x = np.arange(0.0, length, 0.25)
     turn = np.deg2rad(45.0)  # bars are crossed strips, so they show from every side
     parts = []
@@ -240,8 +225,6 @@ def build_railing(length: float, height: float) -> Mesh:
 
 def build_hedge(length: float, width: float, height: float, rng: np.random.Generator) -> Mesh:
     """Make a hedge from the origin along x: a closed body whose skin is bumpy by about 0.1 m [m]."""
-    from rol_sim.world.mesh import Material
-
     n = max(2, round(length / 0.6) + 1)
     x = np.linspace(0.0, length, n)
     profile = np.array([[-0.5, -0.3], [-0.55, 0.5], [-0.35, 1.0], [0.35, 1.0], [0.55, 0.5], [0.5, -0.3]])
@@ -279,8 +262,6 @@ def build_tree(
     mesh : Mesh
         TREE_TRUNK and TREE_CROWN.
     """
-    from rol_sim.world.mesh import Material, make_mesh, merge_meshes
-
     half = 0.5 * (height - crown_base)
     # A triangle of side a shows 0.217 a^2 to a ray on average; the density fixes how many are needed.
     side = 0.7

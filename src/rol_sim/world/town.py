@@ -1,22 +1,21 @@
 """The town: streets, houses, gardens and the land, drawn once; and what differs from one session to the next.
 
-`build_town` draws what stays. `dress` adds what a session finds: parked vehicles, the leaves of its season,
+`build_town` draws what stays. `add_session_objects` adds what a session finds: parked vehicles, the leaves of its season,
 cut hedges, changed street furniture. Both are determined by the generator they are given.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from rol.geometry import transform_points
-
-if TYPE_CHECKING:
-    from rol_sim.world.houses import Builder
-    from rol_sim.world.mesh import Mesh
-    from rol_sim.world.streets import Street, StreetPlan
+from rol_sim.world.houses import Builder, build_landmarks, build_sheds, build_street_side, find_free_plot
+from rol_sim.world.mesh import Material, Mesh, make_mesh, merge_meshes, move_mesh
+from rol_sim.world.shapes import build_hedge, build_quads, build_tree
+from rol_sim.world.streets import Street, StreetPlan, build_plan
+from rol_sim.world.vehicles import PARKED_KINDS, build_furniture, build_vehicle, draw_kind
 
 
 @dataclass(frozen=True)
@@ -67,10 +66,6 @@ def build_town(rng: np.random.Generator, *, loop_length: float = 600.0, relief: 
     town : Town
         The town, centred near the origin.
     """
-    from rol_sim.world.houses import Builder, build_landmarks, build_sheds, build_street_side
-    from rol_sim.world.mesh import merge_meshes, move_mesh
-    from rol_sim.world.streets import build_plan
-
     plan = build_plan(rng, loop_length=loop_length, relief=relief)
     builder = Builder(plan)
     green = build_landmarks(builder, rng)
@@ -88,7 +83,7 @@ def build_town(rng: np.random.Generator, *, loop_length: float = 600.0, relief: 
     return Town(plan, mesh, trees, hedges, slots, tuple(furniture), builder.footprints)
 
 
-def dress(
+def add_session_objects(
     town: Town,
     rng: np.random.Generator,
     *,
@@ -116,10 +111,6 @@ def dress(
     mesh : Mesh
         Parked vehicles, plants, furniture; object numbers go on after those of the town.
     """
-    from rol_sim.world.mesh import merge_meshes, move_mesh
-    from rol_sim.world.shapes import build_hedge, build_tree
-    from rol_sim.world.vehicles import PARKED_KINDS, build_furniture, build_vehicle, draw_kind
-
     number = int(town.mesh.objects.max()) + 1
     bodies: list[tuple[Mesh, np.ndarray]] = []
     for slot in town.slots[rng.random(len(town.slots)) < parked_share]:
@@ -172,8 +163,6 @@ def _far_from_junctions(plan: StreetPlan, points: np.ndarray, distance: float) -
 
 
 def _plant_trees(builder: Builder, green: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    from rol_sim.world.houses import find_room
-
     plan, places = builder.plan, []
     for street in plan.streets:
         for side in (1, -1):
@@ -183,7 +172,7 @@ def _plant_trees(builder: Builder, green: np.ndarray, rng: np.random.Generator) 
                 places.append(at[_far_from_junctions(plan, at, 10.0) & (plan.clearance(at) > 0.4)])
     street_trees = np.concatenate([np.zeros((0, 2)), *places])
     in_green = rng.uniform(-1.0, 1.0, (14, 2)) * green[3:]
-    garden = [find_room(builder, 1.2, 1.2, 2.8, 30.0, rng, tries=4) for _ in range(170)]
+    garden = [find_free_plot(builder, 1.2, 1.2, 2.8, 30.0, rng, tries=4) for _ in range(170)]
     garden_trees = np.array([g[:2] for g in garden if g is not None]).reshape(-1, 2)
     if green[3] > 0:
         garden_trees = np.concatenate([garden_trees, transform_points(green[:3], in_green)])
@@ -209,10 +198,13 @@ def _mark_parking(plan: StreetPlan, street: Street, side: int, rng: np.random.Ge
 def _furnish(plan: StreetPlan, street: Street, rng: np.random.Generator) -> list[tuple[str, np.ndarray]]:
     pieces, length = [], float(street.arc[-1])
     for kind, spacing, back in (
-        ("lamp", 27.0, 0.45), ("sign", 38.0, 0.5), ("bin", 70.0, 1.6), ("cabinet", 110.0, 1.7),
+        ("lamp", 27.0, 0.45),
+        ("sign", 38.0, 0.5),
+        ("bin", 70.0, 1.6),
+        ("cabinet", 110.0, 1.7),
         ("post_box", 190.0, 0.6),
         ("shelter", 210.0, 1.2),
-    ):  # fmt: skip
+    ):
         s = float(rng.uniform(0.2, 1.0)) * spacing
         while s < length - 7.0:
             side = 1 if rng.random() < 0.5 else -1
@@ -238,9 +230,6 @@ def _furnish(plan: StreetPlan, street: Street, rng: np.random.Generator) -> list
 def _build_land(
     plan: StreetPlan, rng: np.random.Generator, spacing: float = 2.0, margin: float = 45.0
 ) -> Mesh:
-    from rol_sim.world.mesh import Material
-    from rol_sim.world.shapes import build_quads
-
     points = np.concatenate([street.centre for street in plan.streets])
     (x0, y0), (x1, y1) = points.min(axis=0) - margin, points.max(axis=0) + margin
     x, y = np.arange(x0, x1, spacing), np.arange(y0, y1, spacing)
@@ -257,9 +246,6 @@ def _build_land(
 
 def _build_pavements(plan: StreetPlan) -> Mesh:
     """Raised footways with upright kerbs; left out where they would cross a carriageway."""
-    from rol_sim.world.mesh import Material, make_mesh, merge_meshes
-    from rol_sim.world.shapes import build_quads
-
     parts = [make_mesh(np.zeros((0, 3)), np.zeros((0, 3)), 0)]
     for street in plan.streets:
         s = np.arange(0.0, street.arc[-1], 1.0)

@@ -5,41 +5,97 @@ Frames as in `shapes`: origin on the ground in the middle of the body, x forward
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
-if TYPE_CHECKING:
-    from rol_sim.world.mesh import Mesh
+from rol_sim.world.mesh import Material, Mesh, merge_meshes
+from rol_sim.world.shapes import build_box, build_cylinder, build_quads
 
 # Side views (x, z), clockwise from the lower front corner, before scaling by length and height; the two
 # numbers after them are the first and the last corner of the glazed part.
 _PROFILES = {
-    "car": ([
-        (0.49, 0.17), (0.50, 0.45), (0.47, 0.52), (0.27, 0.63), (0.12, 0.98), (-0.22, 1.00), (-0.40, 0.66),
-        (-0.49, 0.62), (-0.50, 0.20),
-    ], 3, 6),
-    "estate": ([
-        (0.49, 0.17), (0.50, 0.45), (0.47, 0.52), (0.27, 0.62), (0.12, 0.97), (-0.40, 1.00), (-0.48, 0.60),
-        (-0.50, 0.50), (-0.50, 0.20),
-    ], 3, 6),
-    "van": ([
-        (0.49, 0.14), (0.50, 0.38), (0.46, 0.48), (0.36, 0.54), (0.25, 0.98), (0.10, 1.00), (-0.49, 1.00),
-        (-0.50, 0.60), (-0.50, 0.16),
-    ], 3, 4),
-    "lorry": ([
-        (0.49, 0.12), (0.50, 0.35), (0.50, 0.45), (0.49, 0.75), (0.27, 0.78), (0.26, 1.00), (-0.50, 1.00),
-        (-0.50, 0.60), (-0.50, 0.25),
-    ], 2, 3),
-    "bus": ([
-        (0.49, 0.10), (0.50, 0.30), (0.50, 0.35), (0.49, 0.90), (0.48, 1.00), (-0.49, 1.00), (-0.50, 0.90),
-        (-0.50, 0.35), (-0.50, 0.12),
-    ], 2, 6),
-}  # fmt: skip
+    "car": (
+        [
+            (0.49, 0.17),
+            (0.50, 0.45),
+            (0.47, 0.52),
+            (0.27, 0.63),
+            (0.12, 0.98),
+            (-0.22, 1.00),
+            (-0.40, 0.66),
+            (-0.49, 0.62),
+            (-0.50, 0.20),
+        ],
+        3,
+        6,
+    ),
+    "estate": (
+        [
+            (0.49, 0.17),
+            (0.50, 0.45),
+            (0.47, 0.52),
+            (0.27, 0.62),
+            (0.12, 0.97),
+            (-0.40, 1.00),
+            (-0.48, 0.60),
+            (-0.50, 0.50),
+            (-0.50, 0.20),
+        ],
+        3,
+        6,
+    ),
+    "van": (
+        [
+            (0.49, 0.14),
+            (0.50, 0.38),
+            (0.46, 0.48),
+            (0.36, 0.54),
+            (0.25, 0.98),
+            (0.10, 1.00),
+            (-0.49, 1.00),
+            (-0.50, 0.60),
+            (-0.50, 0.16),
+        ],
+        3,
+        4,
+    ),
+    "lorry": (
+        [
+            (0.49, 0.12),
+            (0.50, 0.35),
+            (0.50, 0.45),
+            (0.49, 0.75),
+            (0.27, 0.78),
+            (0.26, 1.00),
+            (-0.50, 1.00),
+            (-0.50, 0.60),
+            (-0.50, 0.25),
+        ],
+        2,
+        3,
+    ),
+    "bus": (
+        [
+            (0.49, 0.10),
+            (0.50, 0.30),
+            (0.50, 0.35),
+            (0.49, 0.90),
+            (0.48, 1.00),
+            (-0.49, 1.00),
+            (-0.50, 0.90),
+            (-0.50, 0.35),
+            (-0.50, 0.12),
+        ],
+        2,
+        6,
+    ),
+}
 _SIZES = {  # length, width, height [m] and their spread
-    "car": ((4.1, 1.75, 1.45), 0.06), "estate": ((4.6, 1.82, 1.55), 0.06), "van": ((5.2, 1.98, 2.2), 0.08),
-    "lorry": ((7.5, 2.35, 3.1), 0.08), "bus": ((10.2, 2.5, 3.0), 0.04),
-}  # fmt: skip
+    "car": ((4.1, 1.75, 1.45), 0.06),
+    "estate": ((4.6, 1.82, 1.55), 0.06),
+    "van": ((5.2, 1.98, 2.2), 0.08),
+    "lorry": ((7.5, 2.35, 3.1), 0.08),
+    "bus": ((10.2, 2.5, 3.0), 0.04),
+}
 PARKED_KINDS = (("car", 0.58), ("estate", 0.28), ("van", 0.14))
 MOVING_KINDS = (("car", 0.5), ("estate", 0.2), ("van", 0.14), ("lorry", 0.06), ("bus", 0.1))
 
@@ -59,9 +115,6 @@ def build_vehicle(kind: str, rng: np.random.Generator) -> Mesh:
     mesh : Mesh
         VEHICLE body with GLASS panes.
     """
-    from rol_sim.world.mesh import Material, merge_meshes
-    from rol_sim.world.shapes import build_box, build_quads
-
     (length, width, height), spread = _SIZES[kind]
     length, width, height = np.array([length, width, height]) * np.clip(
         rng.normal(1.0, spread, 3), 0.85, 1.15
@@ -96,9 +149,6 @@ def draw_kind(kinds: tuple[tuple[str, float], ...], rng: np.random.Generator) ->
 
 def build_cyclist(rng: np.random.Generator) -> Mesh:
     """Make a person on a bicycle."""
-    from rol_sim.world.mesh import Material, merge_meshes
-    from rol_sim.world.shapes import build_box, build_cylinder
-
     lean = float(rng.uniform(0.1, 0.3))
     rider = build_cylinder(0.2, 0.8, float(rng.uniform(1.6, 1.8)), Material.PERSON, lean=lean)
     frame = build_box(-0.8, 0.8, -0.02, 0.02, 0.35, 0.75, Material.METAL)
@@ -108,9 +158,6 @@ def build_cyclist(rng: np.random.Generator) -> Mesh:
 
 def build_pedestrian(rng: np.random.Generator) -> Mesh:
     """Make a person on foot."""
-    from rol_sim.world.mesh import Material
-    from rol_sim.world.shapes import build_cylinder
-
     return build_cylinder(
         float(rng.uniform(0.18, 0.26)), 0.0, float(rng.uniform(1.5, 1.9)), Material.PERSON, sides=6
     )
@@ -136,9 +183,6 @@ def build_furniture(kind: str, rng: np.random.Generator) -> Mesh:
     ValueError
         If the kind is not known.
     """
-    from rol_sim.world.mesh import Material, merge_meshes
-    from rol_sim.world.shapes import build_box, build_cylinder, build_quads
-
     metal = Material.METAL
     if kind == "lamp":
         tall = float(rng.uniform(5.0, 8.0))

@@ -1,8 +1,7 @@
-"""Pairs for training that are made when asked for, in any heading, from polar scans and lidar points.
+"""Data augmentation: training pairs made on demand from polar scans and lidar points, with random changes.
 
-A radar that turns sees the world from any heading alike. Turning the car's frame before the scan is resampled
-and before the lidar points are drawn gives a pair that is as good as the recorded one: no pixel is
-interpolated twice, no corner is lost. Images as in the bird's-eye room.
+The rotation is applied before the scan is resampled and before the lidar points are rasterized. A rotated pair is
+therefore as good as the recorded one: no pixel is interpolated twice, no corner is lost. Images as in `rol.bev`.
 """
 
 from __future__ import annotations
@@ -33,21 +32,21 @@ class LidarClouds:
     Attributes
     ----------
     points : array, shape (m, 2), int16
-        All points, scan by scan, in steps of `STEP_M`.
+        All points, scan by scan, in units of `STEP_M`.
     starts : array, shape (n + 1,), int64
-        Where each scan begins.
+        Index of the first point of each scan.
     """
 
     points: np.ndarray
     starts: np.ndarray
 
     def cloud(self, index: int) -> np.ndarray:
-        """Give the points of one scan, shape (k, 2) [m]."""
+        """Return the points of one scan, shape (k, 2) [m]."""
         return self.points[self.starts[index] : self.starts[index + 1]] * STEP_M
 
 
 class ScanPairs:
-    """Pairs of one session for training, each made from the polar scan and the lidar points.
+    """Training pairs of one session, made from the polar scans and the lidar points.
 
     Parameters
     ----------
@@ -72,11 +71,11 @@ class ScanPairs:
         return len(self.aligned)
 
     def __getitem__(self, index: int) -> tuple[np.ndarray, np.ndarray]:
-        """Give a pair as it was recorded, see `draw`."""
+        """Return a pair as it was recorded, see `draw`."""
         return self.draw(index, 0.0)
 
     def name(self, index: int) -> str:
-        """Name the file of the scan."""
+        """Return the path of the scan."""
         return str(self.session.radar_path(self.aligned[index].radar_stamp_us))
 
     def draw(
@@ -88,73 +87,77 @@ class ScanPairs:
         n_ghosts: int = 0,
         rng: np.random.Generator | None = None,
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Make one pair, the world turned about the radar, the radar deafer or keener, or dazzled at some bearings.
+        """Make one pair with changes of the surroundings and of the radar.
 
         Parameters
         ----------
         index : int
             Which scan.
         turn : float
-            Counter-clockwise turn of everything that is seen [rad].
+            Counter-clockwise rotation of the surroundings [rad].
         gain_db : float
-            Added to all power that is not zero [dB].
+            Added to all power above zero [dB].
         n_streaks, n_ghosts : int
             Streaks and ghosts added, see `add_streaks` and `add_ghosts`.
         rng : numpy.random.Generator, optional
-            Draws them; needed if there are any.
+            Draws streaks and ghosts; needed if there are any.
 
         Returns
         -------
         radar, lidar : array, shape (1, h, w), float32
-            -1 for code 0 and for empty, +1 for code 255 and for occupied.
+            -1 for grey value 0 and for empty, +1 for 255 and for occupied.
         """
         scan = load_radar(self.session.radar_path(self.aligned[index].radar_stamp_us))
-        codes = shift_codes(scan.power, gain_db)
+        power = apply_gain(scan.power, gain_db)
         if n_streaks + n_ghosts > 0:
             if rng is None:
-                raise ValueError("streaks and ghosts need a generator of random numbers")
-            codes = add_ghosts(add_streaks(codes, n_streaks, rng), n_ghosts, rng)
-        radar = turned_radar_image(codes, scan.azimuths, turn, self.aligned[index].twist, self.settings)
-        c, s = np.cos(turn), np.sin(turn)
-        points = self.clouds.cloud(index) @ np.array([[c, s], [-s, c]])
+                raise ValueError("streaks and ghosts need a random generator")
+            power = add_ghosts(add_streaks(power, n_streaks, rng), n_ghosts, rng)
+        radar = rotated_radar_image(power, scan.azimuths, turn, self.aligned[index].twist, self.settings)
         size = {name: getattr(self.settings, name) for name in ("width", "pixel_size", "max_range")}
-        lidar = points_to_image(points, **size)
+        lidar = points_to_image(rotate_points(self.clouds.cloud(index), turn), **size)
         return normalize_image(radar[None]), normalize_image(lidar[None])
 
 
-def shift_codes(codes: np.ndarray, gain_db: float) -> np.ndarray:
-    """Add a gain [dB] to power codes of half a decibel each; what is zero stays zero, the rest stays above it."""
+def rotate_points(points: np.ndarray, turn: float) -> np.ndarray:
+    """Rotate points counter-clockwise about the radar, shape (n, 2) [m], angle [rad]."""
+    c, s = np.cos(turn), np.sin(turn)
+    return points @ np.array([[c, s], [-s, c]])
+
+
+def apply_gain(power: np.ndarray, gain_db: float) -> np.ndarray:
+    """Add a gain [dB] to power in half-dB steps; zero stays zero, the rest stays above zero."""
     if gain_db == 0.0:
-        return codes
+        return power
     table = np.clip(np.arange(256) + round(2.0 * gain_db), 1, 255).astype(np.uint8)
     table[0] = 0
-    return table[codes]
+    return table[power]
 
 
-def add_streaks(codes: np.ndarray, n: int, rng: np.random.Generator) -> np.ndarray:
-    """Dazzle a scan: a few neighbouring rows are bright along all their length, as behind a very strong reflector.
+def add_streaks(power: np.ndarray, n: int, rng: np.random.Generator) -> np.ndarray:
+    """Add streaks to a scan: a few neighbouring rows that are bright at all ranges, as after a very strong reflector.
 
     Parameters
     ----------
-    codes : array, shape (a, b), uint8
-        Power codes of half a decibel each.
+    power : array, shape (a, b), uint8
+        Power in half-dB steps.
     n : int
         Number of streaks.
     rng : numpy.random.Generator
-        Draws bearing, width, level, slope, grain and beat of each.
+        Draws bearing, width, level, slope, speckle and modulation of each.
 
     Returns
     -------
-    codes : array, shape (a, b), uint8
+    power : array, shape (a, b), uint8
         A copy, nowhere darker than before.
 
     Notes
     -----
-    The ranges of the draws were read off the eleven real scans: one to five rows, a level of 15 to 43 dB that
-    falls by 1.5 to 5 dB each 13 m, grain like that of any echo, and in half of them echoes that come back every few
-    metres. What is real shines through, so the lidar image stays what it is. Not in the paper.
+    The distributions were chosen from the eleven real scans: one to five rows, a level of 15 to 43 dB that falls by
+    1.5 to 5 dB per 13 m, speckle like that of other echoes, and in half of them echoes that repeat every few metres.
+    Stronger real echoes remain, so the lidar image is unchanged.
     """
-    codes, (n_rows, n_bins) = codes.copy(), codes.shape
+    power, (n_rows, n_bins) = power.copy(), power.shape
     bins = np.arange(n_bins, dtype=np.float32)
     for _ in range(n):
         row, half_width = int(rng.integers(n_rows)), rng.uniform(0.5, 2.2)
@@ -167,40 +170,39 @@ def add_streaks(codes: np.ndarray, n: int, rng: np.random.Generator) -> np.ndarr
             grain = np.interp(bins, bins[::5], 20.0 * np.log10(rng.gamma(0.6, 1.5, len(bins[::5])) + 1e-3))
             streak = level - 12.0 * (aside / half_width) ** 2 + grain
             here = (row + aside) % n_rows
-            codes[here] = np.maximum(codes[here], np.clip(streak, 0.0, 250.0).astype(np.uint8))
-    return codes
+            power[here] = np.maximum(power[here], np.clip(streak, 0.0, 250.0).astype(np.uint8))
+    return power
 
 
-def add_ghosts(codes: np.ndarray, n: int, rng: np.random.Generator) -> np.ndarray:
-    """Let bright echoes appear a second time at another place, as behind a mirror, or a vehicle that has come.
+def add_ghosts(power: np.ndarray, n: int, rng: np.random.Generator) -> np.ndarray:
+    """Add ghosts to a scan: copies of bright echoes at other places, as from multipath or from new vehicles.
 
     Parameters
     ----------
-    codes : array, shape (a, b), uint8
-        Power codes of half a decibel each.
+    power : array, shape (a, b), uint8
+        Power in half-dB steps.
     n : int
         Number of ghosts.
     rng : numpy.random.Generator
-        Draws the echo, its size, where it goes and how much weaker it is there.
+        Draws the echo, its size, its new place and its attenuation.
 
     Returns
     -------
-    codes : array, shape (a, b), uint8
+    power : array, shape (a, b), uint8
         A copy, nowhere darker than before.
 
     Notes
     -----
-    A lidar sees no ghosts, and a map no vehicles: what stands alone and has no shape should not be trusted. Not in
-    the paper.
+    The lidar sees no ghosts, and a map holds no vehicles, so the lidar image is unchanged.
     """
-    found, (n_rows, n_bins) = codes.copy(), codes.shape
-    rows, bins = np.nonzero(codes[:, :1500:4] >= 70)  # within the image, 35 dB
+    found, (n_rows, n_bins) = power.copy(), power.shape
+    rows, bins = np.nonzero(power[:, :1500:4] >= 70)  # within the image, 35 dB
     for _ in range(n if len(rows) else 0):
         one = int(rng.integers(len(rows)))
         half_rows, half_bins = int(rng.integers(1, 6)), int(rng.integers(10, 60))
         around = (rows[one] + np.arange(-half_rows, half_rows + 1)) % n_rows
         begin = int(np.clip(4 * bins[one] - half_bins, 0, n_bins - 2 * half_bins))
-        patch = codes[around, begin : begin + 2 * half_bins].astype(np.int64) - int(rng.integers(0, 25))
+        patch = power[around, begin : begin + 2 * half_bins].astype(np.int64) - int(rng.integers(0, 25))
         there = (int(rng.integers(n_rows)) + np.arange(len(around))) % n_rows
         place = int(rng.integers(100, min(1400, n_bins - 2 * half_bins)))
         kept = found[there, place : place + 2 * half_bins]
@@ -208,19 +210,19 @@ def add_ghosts(codes: np.ndarray, n: int, rng: np.random.Generator) -> np.ndarra
     return found
 
 
-def turned_radar_image(
-    codes: np.ndarray, azimuths: np.ndarray, turn: float, twist: Sequence[float], settings: PairSettings
+def rotated_radar_image(
+    power: np.ndarray, azimuths: np.ndarray, turn: float, twist: Sequence[float], settings: PairSettings
 ) -> np.ndarray:
-    """Make the radar image of `rol.pairs.build_pair` from a scan whose surroundings are turned.
+    """Make the radar image of `rol.pairs.build_pair` from a scan with rotated surroundings.
 
     Parameters
     ----------
-    codes, azimuths : array, shape (a, b) and (a,)
-        The scan [rad].
+    power, azimuths : array, shape (a, b) and (a,)
+        The scan in half-dB steps, and counter-clockwise bearings of its rows [rad].
     turn : float
-        Counter-clockwise turn [rad].
+        Counter-clockwise rotation [rad].
     twist : sequence of float
-        Body velocity (vx, vy, yaw rate) before the turn [m/s, m/s, rad/s].
+        Body velocity (vx, vy, yaw rate) before the rotation [m/s, m/s, rad/s].
     settings : PairSettings
         Settings of the image.
 
@@ -231,8 +233,8 @@ def turned_radar_image(
     """
     c, s = np.cos(turn), np.sin(turn)
     vx, vy, rate = twist
-    turned = (c * vx - s * vy, s * vx + c * vy, rate)
-    return radar_to_image(codes, azimuths + turn, turned, settings)
+    rotated = (c * vx - s * vy, s * vx + c * vy, rate)
+    return radar_to_image(power, azimuths + turn, rotated, settings)
 
 
 def gather_clouds(
@@ -244,7 +246,7 @@ def gather_clouds(
     workers: int = 1,
     report: Callable[[str], None] = lambda line: None,
 ) -> LidarClouds:
-    """Read the sweeps of many scans once and keep their points, small enough for memory.
+    """Read the lidar points of many scans once and keep them in a compact file.
 
     Parameters
     ----------
@@ -253,13 +255,13 @@ def gather_clouds(
     aligned : sequence of AlignedScan
         The scans.
     path : path
-        File for the points, ``*.npz``; read instead if it is there and of these scans and settings.
+        File for the points, ``*.npz``; read instead if it exists with these scans and settings.
     settings : PairSettings
         ``motion``, ``min_height`` and ``max_range`` are used.
     workers : int
         Processes.
     report : callable
-        Takes a line about how far it has come.
+        Takes a line about the progress.
 
     Returns
     -------
@@ -286,17 +288,15 @@ def gather_clouds(
 
 def _gather_one(task: tuple[Session, AlignedScan, PairSettings]) -> np.ndarray:
     session, one, settings = task
-    twist, sweeps = (
-        one.twist if settings.motion == "corrected" else None,
-        (one.left_stamp_us, one.right_stamp_us),
-    )
+    twist = one.twist if settings.motion == "corrected" else None
+    sweeps = one.left_stamp_us, one.right_stamp_us
     points = load_lidar_points(session, *sweeps, mid_stamp_us=one.mid_stamp_us, twist=twist)
     points = crop_range(remove_ground(points, settings.min_height), settings.max_range + 0.25)
     return np.unique(np.rint(points[:, :2] / STEP_M).astype(np.int16), axis=0)
 
 
 class JoinedPairs:
-    """Several sets of pairs one after the other, as one.
+    """Concatenation of several sets of pairs.
 
     Parameters
     ----------
@@ -317,16 +317,16 @@ class JoinedPairs:
         return self.parts[part], index - int(self.ends[part] - len(self.parts[part]))
 
     def __getitem__(self, index: int) -> tuple[np.ndarray, np.ndarray]:
-        """Give a pair as it was recorded."""
+        """Return a pair as it was recorded."""
         part, place = self._find(index)
         return part[place]
 
     def draw(self, index: int, *changes: Any) -> tuple[np.ndarray, np.ndarray]:
-        """Give a pair with what `ScanPairs.draw` changes: turn, gain, streaks, ghosts and their generator."""
+        """Return a pair with the changes of `ScanPairs.draw`: turn, gain, streaks, ghosts and their generator."""
         part, place = self._find(index)
         return part.draw(place, *changes)
 
     def name(self, index: int) -> str:
-        """Name the file that a pair comes from."""
+        """Return the path of the scan of a pair."""
         part, place = self._find(index)
         return part.name(place)

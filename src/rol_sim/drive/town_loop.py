@@ -1,4 +1,4 @@
-"""A drive along the loop: where the radar is at any microsecond.
+"""A trajectory along the loop: where the radar is at any microsecond.
 
 The line keeps to the left of the carriageway, wanders a little and is rounded at corners; the speed respects
 lateral and longitudinal acceleration; the car stands at the start and at some junctions. All in the town
@@ -8,19 +8,16 @@ frame (x, y, yaw).
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
 
 from rol.geometry import wrap_angle
-
-if TYPE_CHECKING:
-    from rol_sim.world.streets import StreetPlan
+from rol_sim.world.streets import StreetPlan
 
 LATERAL_ACCELERATION = 1.8  # [m/s^2]
 ACCELERATION, BRAKING = 1.3, 1.7  # [m/s^2]
-STEP_US = 5_000  # truth is kept at 200 Hz
+POSE_STEP_US = 5_000  # truth is kept at 200 Hz
 
 
 @dataclass(frozen=True)
@@ -76,7 +73,7 @@ class Route:
 
 
 @dataclass(frozen=True)
-class Drive:
+class Trajectory:
     """Where the radar is, 200 times a second.
 
     Attributes
@@ -97,7 +94,7 @@ class Drive:
     progress: np.ndarray
 
     def pose(self, query_us: np.ndarray) -> np.ndarray:
-        """Give the poses at any times of the drive.
+        """Give the poses at any times of the trajectory.
 
         Parameters
         ----------
@@ -112,7 +109,7 @@ class Drive:
         Raises
         ------
         ValueError
-            If a time lies outside the drive.
+            If a time lies outside the trajectory.
         """
         t = self._seconds(query_us)
         knots = (self.stamps_us - self.stamps_us[0]) * 1e-6
@@ -120,7 +117,7 @@ class Drive:
         return np.stack([x, y, wrap_angle(yaw)], axis=-1)
 
     def velocity(self, query_us: np.ndarray) -> np.ndarray:
-        """Give the velocities in the town at any times of the drive, shape (m, 2) [m/s]."""
+        """Give the velocities in the town at any times of the trajectory, shape (m, 2) [m/s]."""
         t = self._seconds(query_us)
         speed = np.interp(t, (self.stamps_us - self.stamps_us[0]) * 1e-6, self.speeds)
         yaw = self.pose(query_us)[:, 2]
@@ -131,7 +128,7 @@ class Drive:
         is_outside = (query_us < self.stamps_us[0]) | (query_us > self.stamps_us[-1])
         if is_outside.any():
             span = f"{self.stamps_us[0]} .. {self.stamps_us[-1]}"
-            raise ValueError(f"time {query_us[is_outside][0]} us lies outside the drive, {span} us")
+            raise ValueError(f"time {query_us[is_outside][0]} us lies outside the trajectory, {span} us")
         return (query_us - self.stamps_us[0]) * 1e-6
 
 
@@ -160,7 +157,7 @@ def build_route(plan: StreetPlan, *, rounding: float = 5.5, spacing: float = 0.2
     return Route(points, gap, np.sort(np.array(nearest) * gap))
 
 
-def plan_drive(
+def plan_trajectory(
     route: Route,
     first_stamp_us: int,
     duration_s: float,
@@ -170,7 +167,7 @@ def plan_drive(
     cruise_mps: float = 7.5,
     n_stops: int = 2,
     stand_s: float = 1.5,
-) -> Drive:
+) -> Trajectory:
     """Drive along the route.
 
     Parameters
@@ -178,9 +175,9 @@ def plan_drive(
     route : Route
         The route.
     first_stamp_us : int
-        Time of the first radar scan [us]; the drive begins one second before it.
+        Time of the first radar scan [us]; the trajectory begins one second before it.
     duration_s : float
-        Time from the first scan to the end of the last; the drive ends one second after it [s].
+        Time from the first scan to the end of the last; the trajectory ends one second after it [s].
     rng : numpy.random.Generator
         Draws wander, start offset, speed changes and where the car stops.
     start_m : float
@@ -194,7 +191,7 @@ def plan_drive(
 
     Returns
     -------
-    drive : Drive
+    trajectory : Trajectory
         Truth at 200 Hz.
 
     Raises
@@ -216,14 +213,14 @@ def plan_drive(
     limit = np.minimum(limit, np.sqrt(LATERAL_ACCELERATION / np.maximum(curvature, 1e-4)))
     stops = _choose_stops(route, start, n_stops, rng, reach=5.0 * duration_s)
     times = _time_of_arrival(along, s, limit, stops, 1.0 + stand_s)
-    count, spare = int((duration_s + 2.0) * 1e6 / STEP_US) + 1, 400
-    grid = STEP_US * 1e-6 * np.arange(count + spare)
+    count, spare = int((duration_s + 2.0) * 1e6 / POSE_STEP_US) + 1, 400
+    grid = POSE_STEP_US * 1e-6 * np.arange(count + spare)
     travelled = np.interp(grid, times.ravel(), np.repeat(along, 2))
-    travelled = gaussian_filter1d(travelled, 0.25e6 / STEP_US, mode="nearest")  # no sudden jerks
-    speeds, travelled = np.gradient(travelled, STEP_US * 1e-6)[:count], travelled[:count]
+    travelled = gaussian_filter1d(travelled, 0.25e6 / POSE_STEP_US, mode="nearest")  # no sudden jerks
+    speeds, travelled = np.gradient(travelled, POSE_STEP_US * 1e-6)[:count], travelled[:count]
     poses = np.stack([np.interp(travelled, along, v) for v in (line[:, 0], line[:, 1], yaw)], axis=-1)
-    stamps = first_stamp_us - 1_000_000 + STEP_US * np.arange(count, dtype=np.int64)
-    return Drive(stamps, poses, speeds, np.interp(travelled, along, s))
+    stamps = first_stamp_us - 1_000_000 + POSE_STEP_US * np.arange(count, dtype=np.int64)
+    return Trajectory(stamps, poses, speeds, np.interp(travelled, along, s))
 
 
 def _space_evenly(points: np.ndarray, spacing: float) -> tuple[np.ndarray, float]:

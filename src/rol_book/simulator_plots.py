@@ -35,8 +35,13 @@ def draw_statistics(found: Mapping[str, dict]) -> Figure:
     """
     figure, axes = plt.subplots(2, 3, figsize=(9.6, 6.2), dpi=84)
     draws = (
-        _draw_histogram, _draw_zeros, _draw_range_correlation, _draw_rings, _draw_azimuth_spread, _draw_range_spread,
-    )  # fmt: skip
+        _draw_histogram,
+        _draw_zeros,
+        _draw_range_correlation,
+        _draw_rings,
+        _draw_azimuth_spread,
+        _draw_range_spread,
+    )
     for ax, draw in zip(axes.ravel(), draws, strict=True):
         for (name, statistics), look in zip(found.items(), STYLES, strict=False):
             draw(ax, statistics, {**look, "label": name})
@@ -68,7 +73,7 @@ def draw_doppler(ax: Axes, found: Mapping[str, dict]) -> Axes:
     return ax
 
 
-def draw_give_aways(axes: Sequence[Axes], found: Mapping[str, Mapping[str, float]]) -> Sequence[Axes]:
+def draw_auc_by_group(axes: Sequence[Axes], found: Mapping[str, Mapping[str, float]]) -> Sequence[Axes]:
     """Draw by which patches a classifier tells simulated from real scans.
 
     Parameters
@@ -76,7 +81,7 @@ def draw_give_aways(axes: Sequence[Axes], found: Mapping[str, Mapping[str, float
     axes : sequence of Axes
         One for each way to sort the patches.
     found : mapping
-        What `telling.give_aways` gives.
+        What `telling.auc_by_group` gives.
 
     Returns
     -------
@@ -110,9 +115,14 @@ def draw_polar_pair(
     """
     for ax, (title, codes) in zip(axes, scans.items(), strict=True):
         ax.imshow(
-            codes, cmap=GREYS, aspect="auto", vmin=0, vmax=96, interpolation="antialiased",
+            codes,
+            cmap=GREYS,
+            aspect="auto",
+            vmin=0,
+            vmax=96,
+            interpolation="antialiased",
             extent=(OFFSET_M, OFFSET_M + BIN_M * codes.shape[1], 360, 0),
-        )  # fmt: skip
+        )
         ax.set(title=title, xlim=(0, max_range), yticks=np.arange(0, 361, 90), ylabel="azimuth [deg]")
         ax.grid(False)
     axes[-1].set_xlabel("range [m]")
@@ -126,7 +136,7 @@ def _draw_histogram(ax: Axes, statistics: dict, look: dict) -> None:
 
 
 def _draw_zeros(ax: Axes, statistics: dict, look: dict) -> None:
-    ranges, shares = zip(*statistics["zero_shares"].items(), strict=True)
+    ranges, shares = zip(*statistics["zero_fractions"].items(), strict=True)
     ax.plot(ranges, shares, marker="o", markersize=3.5, **look)
     ax.set(xlabel="range [m]", ylabel="share of code 0", title="quiet bins", ylim=(0.25, 0.6))
 
@@ -138,7 +148,7 @@ def _draw_range_correlation(ax: Axes, statistics: dict, look: dict) -> None:
 
 
 def _draw_rings(ax: Axes, statistics: dict, look: dict) -> None:
-    rings = statistics["shares_40_by_range"]
+    rings = statistics["fractions_40_by_range"]
     middles = [np.sqrt(np.prod([float(edge) for edge in ring.split("-")])) for ring in rings]
     ax.loglog(middles, list(rings.values()), marker="o", markersize=3.5, **look)
     ax.set(xlabel="range [m]", ylabel="share of codes ≥ 40", title="brightness")

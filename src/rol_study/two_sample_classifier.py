@@ -2,7 +2,7 @@
 
 A small convolutional network looks at patches of 16 azimuths x 64 range bins and says "real" or "simulated". It
 learns on some scans and is judged on others. An area under the curve of 0.5 means that it cannot tell, 1 that
-it always can. `give_aways` says where it can.
+it always can. `auc_by_group` says where it can.
 """
 
 from __future__ import annotations
@@ -11,12 +11,15 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
+from scipy.stats import rankdata
+
+from rol.radar import MEASURED
 
 ROWS, BINS = 16, 64  # size of a patch
 
 
 @dataclass(frozen=True)
-class Verdict:
+class ClassifierResult:
     """What a classifier found on scans that it had not learnt from.
 
     Attributes
@@ -65,14 +68,12 @@ def area_under_curve(real: np.ndarray, simulated: np.ndarray) -> float:
     auc : float
         Between 0 and 1; 0.5 if the scores tell nothing.
     """
-    from scipy.stats import rankdata
-
     real, simulated = np.ravel(real), np.ravel(simulated)
     ranks = rankdata(np.concatenate([real, simulated]))[: len(real)]
     return float((ranks.sum() - 0.5 * len(real) * (len(real) + 1)) / (len(real) * len(simulated)))
 
 
-def tell_apart(
+def train_classifier(
     real: np.ndarray,
     simulated: np.ndarray,
     rng: np.random.Generator,
@@ -80,7 +81,7 @@ def tell_apart(
     folds: int = 3,
     epochs: int = 4,
     bf16: bool = False,
-) -> Verdict:
+) -> ClassifierResult:
     """Train classifiers on some scans and judge them on the others.
 
     Parameters
@@ -99,7 +100,7 @@ def tell_apart(
 
     Returns
     -------
-    verdict : Verdict
+    verdict : ClassifierResult
 
     Raises
     ------
@@ -117,16 +118,18 @@ def tell_apart(
         classifier = _train(patches[:, learnt], rng, epochs, bf16)
         scores[:, left_out] = _score(classifier, patches[:, left_out], bf16)
         aucs.append(area_under_curve(*scores[:, left_out]))
-    return Verdict(area_under_curve(*scores), np.array(aucs), scores)
+    return ClassifierResult(area_under_curve(*scores), np.array(aucs), scores)
 
 
-def give_aways(verdict: Verdict, real: np.ndarray, simulated: np.ndarray) -> dict[str, dict[str, float]]:
+def auc_by_group(
+    verdict: ClassifierResult, real: np.ndarray, simulated: np.ndarray
+) -> dict[str, dict[str, float]]:
     """Say by what patches the classifier tells the two apart.
 
     Parameters
     ----------
-    verdict : Verdict
-        From `tell_apart`.
+    verdict : ClassifierResult
+        From `train_classifier`.
     real, simulated : array, shape (n, 400, 3768), uint8
         The scans that it was made from.
 
@@ -136,8 +139,6 @@ def give_aways(verdict: Verdict, real: np.ndarray, simulated: np.ndarray) -> dic
         "range": area under the curve of patches by range "low-high" [m]; "brightest": by the brightest code
         in the patch. 0.5 where it cannot tell.
     """
-    from rol.radar import MEASURED
-
     peaks = np.stack([cut_patches(real), cut_patches(simulated)]).max(axis=(-1, -2))
     range_m = np.broadcast_to((np.arange(peaks.shape[3]) + 0.5) * BINS * MEASURED.resolution_m, peaks.shape)
     found: dict[str, dict[str, float]] = {}
@@ -162,11 +163,20 @@ def _train(patches: np.ndarray, rng: np.random.Generator, epochs: int, bf16: boo
 
     torch.manual_seed(int(rng.integers(2**31)))
     classifier = nn.Sequential(
-        nn.Conv2d(1, 16, 5, padding=2), nn.MaxPool2d(2), nn.ReLU(),  # on a quarter of the values
-        nn.Conv2d(16, 32, 3, padding=1), nn.MaxPool2d(2), nn.ReLU(),
-        nn.Conv2d(32, 48, 3, padding=1), nn.ReLU(), nn.AdaptiveAvgPool2d(1), nn.Flatten(),
-        nn.Linear(48, 32), nn.ReLU(), nn.Linear(32, 1),
-    ).to(memory_format=torch.channels_last)  # fmt: skip
+        nn.Conv2d(1, 16, 5, padding=2),
+        nn.MaxPool2d(2),
+        nn.ReLU(),  # on a quarter of the values
+        nn.Conv2d(16, 32, 3, padding=1),
+        nn.MaxPool2d(2),
+        nn.ReLU(),
+        nn.Conv2d(32, 48, 3, padding=1),
+        nn.ReLU(),
+        nn.AdaptiveAvgPool2d(1),
+        nn.Flatten(),
+        nn.Linear(48, 32),
+        nn.ReLU(),
+        nn.Linear(32, 1),
+    ).to(memory_format=torch.channels_last)
     flat = patches.reshape(2, -1, 1, ROWS, BINS)
     images = torch.from_numpy(flat.reshape(-1, 1, ROWS, BINS))
     labels = torch.cat([torch.ones(flat.shape[1]), torch.zeros(flat.shape[1])])

@@ -8,9 +8,9 @@ import pytest
 from rol.oxford import load_radar
 from rol_data import rall
 from rol_sim.sensors.radar_signal import echoes_to_codes, range_to_bins
-from rol_sim.session.assembly import build_twins, make_scan
+from rol_sim.session.simulation import build_twins, make_scan
 from rol_study import radar_statistics as statistics
-from rol_study import two_sample as telling
+from rol_study import two_sample_classifier
 
 
 def noise_scans(n: int, scale: float, seed: int) -> np.ndarray:
@@ -54,11 +54,11 @@ def test_map_shares_count_peaks_near_the_map() -> None:
     scans, poses = moving_scans(0.0)
     rng = np.random.default_rng(5)
     points = rng.uniform(-60.0, 60.0, (160, 2))
-    assert statistics.map_shares(scans[3:4], poses[3:4], points)[0, 1] > 0.9
-    half = statistics.map_shares(scans[3:4], poses[3:4], points[:80])[0, 1]
+    assert statistics.map_fractions(scans[3:4], poses[3:4], points)[0, 1] > 0.9
+    half = statistics.map_fractions(scans[3:4], poses[3:4], points[:80])[0, 1]
     assert 0.35 < half < 0.75
     empty = np.zeros((1, 400, 3768), dtype=np.uint8)
-    assert np.isnan(statistics.map_shares(empty, poses[:1], points)).all()
+    assert np.isnan(statistics.map_fractions(empty, poses[:1], points)).all()
 
 
 def test_hellinger_distance_of_histograms() -> None:
@@ -69,15 +69,15 @@ def test_hellinger_distance_of_histograms() -> None:
 
 
 def test_area_under_curve() -> None:
-    assert telling.area_under_curve(np.array([2.0, 3.0]), np.array([0.0, 1.0])) == 1.0
-    assert telling.area_under_curve(np.array([0.0, 1.0]), np.array([2.0, 3.0])) == 0.0
-    assert telling.area_under_curve(np.ones(3), np.ones(4)) == 0.5
-    assert telling.area_under_curve(np.array([1.0, 3.0]), np.array([2.0])) == 0.5
+    assert two_sample_classifier.area_under_curve(np.array([2.0, 3.0]), np.array([0.0, 1.0])) == 1.0
+    assert two_sample_classifier.area_under_curve(np.array([0.0, 1.0]), np.array([2.0, 3.0])) == 0.0
+    assert two_sample_classifier.area_under_curve(np.ones(3), np.ones(4)) == 0.5
+    assert two_sample_classifier.area_under_curve(np.array([1.0, 3.0]), np.array([2.0])) == 0.5
 
 
 def test_patches_tile_the_scan() -> None:
     scan = np.arange(400 * 3768, dtype=np.uint32).reshape(1, 400, 3768)
-    patches = telling.cut_patches(scan)
+    patches = two_sample_classifier.cut_patches(scan)
     assert patches.shape == (1, 25, 58, 16, 64)
     np.testing.assert_array_equal(patches[0, 3, 7], scan[0, 48:64, 448:512])
 
@@ -85,19 +85,19 @@ def test_patches_tile_the_scan() -> None:
 def test_classifier_tells_what_differs_and_nothing_else() -> None:
     one, same, louder = noise_scans(2, 1.0, 1), noise_scans(2, 1.0, 2), noise_scans(2, 1.5, 3)
     rng = np.random.default_rng(0)
-    alike = telling.tell_apart(one, same, rng, folds=2, epochs=2)
+    alike = two_sample_classifier.train_classifier(one, same, rng, folds=2, epochs=2)
     assert abs(alike.auc - 0.5) < 0.06 and alike.scores.shape == (2, 2, 25, 58)
-    other = telling.tell_apart(one, louder, rng, folds=2, epochs=2)
+    other = two_sample_classifier.train_classifier(one, louder, rng, folds=2, epochs=2)
     assert other.auc > 0.9 and len(other.fold_aucs) == 2
-    rounded = telling.tell_apart(one, louder, rng, folds=2, epochs=2, bf16=True)
+    rounded = two_sample_classifier.train_classifier(one, louder, rng, folds=2, epochs=2, bf16=True)
     assert abs(rounded.auc - other.auc) < 0.02
     assert not (
         rounded.scores.astype(np.float32).view(np.uint32) & 0xFFFF
     ).any()  # the bits that bf16 leaves out
-    found = telling.give_aways(other, one, louder)
+    found = two_sample_classifier.auc_by_group(other, one, louder)
     assert found["range"]["110-170"] > 0.9
     with pytest.raises(ValueError, match="cannot be split"):
-        telling.tell_apart(one, louder[:1], rng)
+        two_sample_classifier.train_classifier(one, louder[:1], rng)
 
 
 def test_twins_have_the_statistics_of_the_real_scans(real_root: Path) -> None:
@@ -111,11 +111,11 @@ def test_twins_have_the_statistics_of_the_real_scans(real_root: Path) -> None:
     assert statistics.hellinger_distance(ours["histogram"], theirs["histogram"]) < 0.1
     for code, share in theirs["shares"].items():
         assert 1.0 / 1.5 < ours["shares"][code] / share < 1.5, code
-    for range_m, share in theirs["zero_shares"].items():
-        assert abs(ours["zero_shares"][range_m] - share) < 0.05, range_m
+    for range_m, share in theirs["zero_fractions"].items():
+        assert abs(ours["zero_fractions"][range_m] - share) < 0.05, range_m
     np.testing.assert_allclose(ours["range_correlation"], theirs["range_correlation"], atol=0.05)
     assert abs(ours["azimuth_correlation"] - theirs["azimuth_correlation"]) < 0.05
     poses, points = np.array(list(known.values())), rall.load_map_points(real_root / rall.MAP_PATH)
-    on_map = [statistics.map_shares(scans, poses, points)[:, 0].mean() for scans in (codes, real)]
+    on_map = [statistics.map_fractions(scans, poses, points)[:, 0].mean() for scans in (codes, real)]
     assert abs(on_map[0] - on_map[1]) < 0.08
     assert statistics.motion_statistics(codes, poses)["doppler_seconds"] == pytest.approx(0.05, abs=0.021)
