@@ -2,7 +2,7 @@
 
 python benchmarks/simulator.py [--scans 40]      prints a table and writes build/benchmarks/simulator.json
 
-Medians over scans of one process on one thread; the sessions of a drive are written by as many processes as wanted. With
+Medians over scans of one process on one thread; the sessions of a trajectory are written by as many processes as wanted. With
 the real data at hand the world is that of the route, without them the simulated town.
 """
 
@@ -48,7 +48,7 @@ def time_scan(session: SimulatedSession, index: int, folder: Path) -> dict[str, 
     marks = [perf_counter()]
     scene = session.scene_at(stamp + 0.5 * turn)
     marks.append(perf_counter())
-    rays = radar_sensor.emit_rays(session.drive.pose(times), rng, settings)
+    rays = radar_sensor.emit_rays(session.trajectory.pose(times), rng, settings)
     marks.append(perf_counter())
     rows, ranges, powers, _, _ = radar_sensor.trace_echoes(scene, rays, settings)
     marks.append(perf_counter())

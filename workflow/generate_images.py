@@ -1,6 +1,6 @@
 """Generate the lidar images of one session; the slow part of chapter 05, as a job of its own for each session.
 
-    python workflow/generate_images.py build/demo/pairs/NAME data/weights/rol.safetensors build/demo/fake/NAME
+    python workflow/generate_images.py build/demo/pairs/NAME data/weights/unet.safetensors build/demo/fake/NAME
 
 A run that was stopped goes on with the missing images. Chapter 05 makes the same images where they are missing.
 """
@@ -12,7 +12,8 @@ import sys
 
 import torch
 
-from rol.fakes import translate_session
+import rol_beyond.unet  # noqa: F401 (registers the architecture)
+from rol_beyond.generated import generate_session
 from rol_book.parameters import positive
 
 BF16 = {"auto": "auto", "true": True, "false": False}
@@ -43,7 +44,7 @@ def main(words: list[str] | None = None) -> int:
     torch.set_num_threads(given.threads)
     options = {"threshold": given.threshold, "device": given.device, "bf16": BF16[given.bf16]}
     try:
-        n_images = sum(1 for _ in translate_session(given.weights, given.pairs, given.out, **options))
+        n_images = sum(1 for _ in generate_session(given.weights, given.pairs, given.out, **options))
     except (ValueError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 1

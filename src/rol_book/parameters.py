@@ -36,7 +36,7 @@ CHOICES: dict[str, tuple[Any, ...]] = {  # parameter -> all its values
     "motion": ("none", "corrected"),
     "points_source": ("raw", "fake", "real", "fake-corrected"),
 }
-MAY_BE_ZERO = ("seed", "twin_seed", "scan_number", "rendered_first", "gap_scans", "steps", "blocks")
+MAY_BE_ZERO = ("seed", "twin_seed", "scan_number", "rendered_first", "gap_scans", "steps", "n_blocks")
 NETWORKS = {
     "network": "safetensors",
     "compared": "safetensors",

@@ -210,8 +210,13 @@ def _page(data: dict, words: str, width: int, height: int, draw: str) -> str:
     text = json.dumps(data, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
     return _PAGE.substitute(
         name="player-" + hashlib.sha256(text.encode()).hexdigest()[:10],
-        words=html.escape(words), width=width, height=height, last=len(data["frames"]) - 1, data=text, draw=draw,
-    )  # fmt: skip
+        words=html.escape(words),
+        width=width,
+        height=height,
+        last=len(data["frames"]) - 1,
+        data=text,
+        draw=draw,
+    )
 
 
 def _thin(points: np.ndarray, most: int) -> np.ndarray:

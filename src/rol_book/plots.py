@@ -394,9 +394,22 @@ def show_poses(
     look = {"color": colour} if values is None else {"cmap": "viridis"}
     shade = () if values is None else (values,)
     return ax.quiver(
-        y, x, length * np.sin(yaw), length * np.cos(yaw), *shade, angles="xy", scale_units="xy", scale=1.0,
-        units="xy", width=0.09 * length, headwidth=3.2, headlength=4.0, headaxislength=3.6, zorder=3, **look,
-    )  # fmt: skip
+        y,
+        x,
+        length * np.sin(yaw),
+        length * np.cos(yaw),
+        *shade,
+        angles="xy",
+        scale_units="xy",
+        scale=1.0,
+        units="xy",
+        width=0.09 * length,
+        headwidth=3.2,
+        headlength=4.0,
+        headaxislength=3.6,
+        zorder=3,
+        **look,
+    )
 
 
 def draw_result_row(
@@ -432,14 +445,18 @@ def draw_result_row(
     axes[0].legend(loc="best", fontsize=8.5)
     share = 100.0 / len(position_m)
     axes[1].hist(
-        np.clip(position_m, 0.0, max_m), np.linspace(0.0, max_m, 26), weights=np.full(len(position_m), share),
+        np.clip(position_m, 0.0, max_m),
+        np.linspace(0.0, max_m, 26),
+        weights=np.full(len(position_m), share),
         color=COLOURS["estimate"],
-    )  # fmt: skip
+    )
     axes[1].set(xlabel="position error [m]", ylabel="scans [%]", xlim=(0.0, max_m))
     axes[2].hist(
-        np.clip(yaw_deg, -max_deg, max_deg), np.linspace(-max_deg, max_deg, 41),
-        weights=np.full(len(yaw_deg), share), color=COLOURS["real"],
-    )  # fmt: skip
+        np.clip(yaw_deg, -max_deg, max_deg),
+        np.linspace(-max_deg, max_deg, 41),
+        weights=np.full(len(yaw_deg), share),
+        color=COLOURS["real"],
+    )
     axes[2].set(xlabel="heading error [deg]", ylabel="scans [%]", xlim=(-max_deg, max_deg))
     return axes
 
@@ -683,9 +700,14 @@ def draw_polar(
         The axes.
     """
     shown = ax.imshow(
-        codes, cmap="gray_r", aspect="auto", vmin=0, vmax=110, extent=(offset_m, offset_m + bin_m * codes.shape[1], 360, 0),
+        codes,
+        cmap="gray_r",
+        aspect="auto",
+        vmin=0,
+        vmax=110,
+        extent=(offset_m, offset_m + bin_m * codes.shape[1], 360, 0),
         interpolation="antialiased",
-    )  # fmt: skip
+    )
     ax.set(
         title="as stored",
         xlabel="range [m]",

@@ -9,12 +9,14 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from rol.radar import MEASURED
+
 STYLES = (
     {"color": "#0072B2", "linestyle": "-"},
     {"color": "#E69F00", "linestyle": "-"},
     {"color": "#009E73", "linestyle": "--"},
 )
-BIN_M, OFFSET_M = 0.0438, -0.31  # as `radar` has them
+BIN_M, OFFSET_M = MEASURED.resolution_m, MEASURED.offset_m
 GREYS = plt.get_cmap("gray_r", 12)  # few levels: noise in fine ones makes large files and shows no more
 
 
@@ -33,8 +35,13 @@ def draw_statistics(found: Mapping[str, dict]) -> Figure:
     """
     figure, axes = plt.subplots(2, 3, figsize=(9.6, 6.2), dpi=84)
     draws = (
-        _draw_histogram, _draw_zeros, _draw_range_correlation, _draw_rings, _draw_azimuth_spread, _draw_range_spread,
-    )  # fmt: skip
+        _draw_histogram,
+        _draw_zeros,
+        _draw_range_correlation,
+        _draw_rings,
+        _draw_azimuth_spread,
+        _draw_range_spread,
+    )
     for ax, draw in zip(axes.ravel(), draws, strict=True):
         for (name, statistics), look in zip(found.items(), STYLES, strict=False):
             draw(ax, statistics, {**look, "label": name})
@@ -108,9 +115,14 @@ def draw_polar_pair(
     """
     for ax, (title, codes) in zip(axes, scans.items(), strict=True):
         ax.imshow(
-            codes, cmap=GREYS, aspect="auto", vmin=0, vmax=96, interpolation="antialiased",
+            codes,
+            cmap=GREYS,
+            aspect="auto",
+            vmin=0,
+            vmax=96,
+            interpolation="antialiased",
             extent=(OFFSET_M, OFFSET_M + BIN_M * codes.shape[1], 360, 0),
-        )  # fmt: skip
+        )
         ax.set(title=title, xlim=(0, max_range), yticks=np.arange(0, 361, 90), ylabel="azimuth [deg]")
         ax.grid(False)
     axes[-1].set_xlabel("range [m]")

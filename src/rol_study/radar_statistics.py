@@ -14,14 +14,13 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from rol.geometry import relative_pose, transform_points
-from rol.radar import MEASURED_RANGE_OFFSET, k_strongest_peaks, polar_to_cartesian
+from rol.radar import MEASURED, ScanMotion, k_strongest_peaks, polar_to_cartesian
 from rol_sim.sensors.radar import beam_azimuths
 
 BRIGHTNESS_CODES = (40, 60, 80, 100, 120)
 ZERO_RANGES_M = (3.0, 28.0, 41.0, 80.0, 106.0, 145.0)
 NEAR_RANGES_M = (0.0, 0.86, 2.0, 3.0)
 PEAK_EDGES = (0, 110, 130, 133, 256)
-MEASURED_RANGE_RESOLUTION = 0.0438  # bins are named by bin * resolution here, as the measured figures are
 QUIET_CODE = 30  # a piece of a row whose codes stay below this holds noise and little else
 FAR_BIN = 3000
 
@@ -104,7 +103,7 @@ def zero_fractions(
     codes : array, shape (..., 400, 3768), uint8
         Scans.
     ranges_m : tuple of float
-        Ranges, counted as bin * 0.0438 [m].
+        Ranges, counted as bin * MEASURED.resolution_m [m].
     half_bins : int
         Pieces of 2 * half_bins bins around a range are looked at; those that reach code 30 are left out.
 
@@ -116,7 +115,7 @@ def zero_fractions(
     scans = _rows(codes)
     shares = {}
     for range_m in ranges_m:
-        middle = round(range_m / MEASURED_RANGE_RESOLUTION)
+        middle = round(range_m / MEASURED.resolution_m)
         piece = scans[:, max(middle - half_bins, 0) : middle + half_bins]
         quiet = piece[piece.max(axis=1) < QUIET_CODE]
         shares[range_m] = float((quiet == 0).mean()) if len(quiet) else float("nan")
@@ -182,7 +181,7 @@ def near_field(codes: np.ndarray, ranges_m: tuple[float, ...] = NEAR_RANGES_M) -
     codes : array, shape (..., 400, 3768), uint8
         Scans.
     ranges_m : tuple of float
-        Ranges, counted as bin * 0.0438 [m].
+        Ranges, counted as bin * MEASURED.resolution_m [m].
 
     Returns
     -------
@@ -190,7 +189,7 @@ def near_field(codes: np.ndarray, ranges_m: tuple[float, ...] = NEAR_RANGES_M) -
         Range [m] -> mean code over all rows.
     """
     scans = _rows(codes)
-    return {r: float(scans[:, round(r / MEASURED_RANGE_RESOLUTION)].mean()) for r in ranges_m}
+    return {r: float(scans[:, round(r / MEASURED.resolution_m)].mean()) for r in ranges_m}
 
 
 def floor_by_peak(codes: np.ndarray, edges: tuple[int, ...] = PEAK_EDGES) -> dict[str, float]:
@@ -305,12 +304,15 @@ def _mean_correlation(
     middle = (width - 1) / 2.0
     images = [
         polar_to_cartesian(
-            scan, azimuths, range_resolution=MEASURED_RANGE_RESOLUTION, range_offset=MEASURED_RANGE_OFFSET,
-            pixel_size=pixel, width=width, twist=None if twists is None else twists[i],
-            doppler_seconds=doppler_seconds,
+            scan,
+            azimuths,
+            calibration=MEASURED,
+            pixel_size=pixel,
+            width=width,
+            motion=None if twists is None else ScanMotion(twists[i], doppler_seconds=doppler_seconds),
         )
         for i, scan in enumerate(codes)
-    ]  # fmt: skip
+    ]
     away = np.hypot(*(np.mgrid[:width, :width] - middle)) * pixel
     own = np.where((away > 4.0) & (away < 50.0), np.float32(0.0), np.float32(np.nan))  # no leakage
     for before, after, (x, y, yaw) in zip(images[:-lag], images[lag:], ways, strict=True):
@@ -378,14 +380,14 @@ def fractions_by_range(
     code : int
         Code to count from.
     edges_m : tuple of float
-        Edges of the rings, counted as bin * 0.0438 [m].
+        Edges of the rings, counted as bin * MEASURED.resolution_m [m].
 
     Returns
     -------
     shares : dict
         "low-high" [m] -> share [0..1].
     """
-    scans, bins = _rows(codes), [round(edge / MEASURED_RANGE_RESOLUTION) for edge in edges_m]
+    scans, bins = _rows(codes), [round(edge / MEASURED.resolution_m) for edge in edges_m]
     names = [f"{low:g}-{high:g}" for low, high in pairwise(edges_m)]
     shares = [float((scans[:, low:high] >= code).mean()) for low, high in pairwise(bins)]
     return dict(zip(names, shares, strict=True))
@@ -425,9 +427,13 @@ def map_fractions(
     tree, shares = cKDTree(map_points), []
     for scan, pose in zip(codes, poses, strict=True):
         peaks = k_strongest_peaks(
-            scan, beam_azimuths(), k, min_code, max_range_m=max_range_m,
-            range_resolution=MEASURED_RANGE_RESOLUTION, range_offset=MEASURED_RANGE_OFFSET,
-        )  # fmt: skip
+            scan,
+            beam_azimuths(),
+            k,
+            min_code,
+            range_limits_m=(2.5, max_range_m),
+            calibration=MEASURED,
+        )
         gaps = tree.query(transform_points(pose, peaks))[0]
         shares.append([float(np.mean(gaps < limit)) if len(gaps) else float("nan") for limit in within_m])
     return np.array(shares)

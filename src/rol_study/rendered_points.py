@@ -17,7 +17,7 @@ from rol.geometry import relative_pose
 from rol.oxford import RadarOdometry
 from rol.pairs import estimate_twists
 from rol.pix2pix import TrainedNetwork
-from rol_beyond.front_ends import translate_scan
+from rol_beyond.front_ends import generate_points
 from rol_data import rall
 from rol_sim.session.settings import parse_settings
 from rol_sim.session.simulation import SimulatedSession, build_session, make_scan
@@ -34,7 +34,7 @@ def render_points(
     seed: int,
     *,
     bf16: bool = False,
-    headings: int | None = None,
+    tta_rotations: int | None = None,
     **changes: Any,
 ) -> Iterator[np.ndarray]:
     """Give the fake lidar points of a stretch of a real session, scan by scan, as its radar might have led to them.
@@ -54,9 +54,8 @@ def render_points(
         From `rol.pix2pix.load_network`; threshold and thinning are its own.
     seed : int
         Draws all that is simulated: the same seed, the same world for all sessions, each on a day of its own.
-    bf16, headings
-        Of `rol_beyond.front_ends.translate_scan`: multiply in bfloat16; quarter turns to average, the network's own number if not
-        given.
+    bf16, tta_rotations
+        Of `rol_beyond.front_ends.generate_points`.
     **changes
         Settings of `SessionSettings` other than those of the twins in chapter 1, such as ``changed_share``.
 
@@ -81,17 +80,17 @@ def render_points(
     In memory are the map, one scan, and the world within 180 m of the stretch. What has changed since the map was made is
     drawn for a stretch: another ``first_scan`` or ``n_scans`` is another day.
 
-    The network `rol` learnt on this route, in such a world of seed 21: from scans 0 to 4999 of session 02 but for the
+    The network `unet` was trained on this route, in such a world of seed 21: from scans 0 to 4999 of session 02 but for the
     surroundings of the eleven real scans and of one more place (``sets`` in its card). Clouds from there flatter it.
     """
     session = build_segment(real_root, number, first_scan, n_scans, seed, **changes)
-    return _translate(session, network, bf16=bf16, headings=headings)
+    return _generate(session, network, bf16=bf16, tta_rotations=tta_rotations)
 
 
 def build_segment(
     real_root: Path | str, number: str, first_scan: int, n_scans: int, seed: int, **changes: Any
 ) -> SimulatedSession:
-    """Prepare the drive along a stretch of a real session, see `render_points`.
+    """Prepare the trajectory along a stretch of a real session, see `render_points`.
 
     Returns
     -------
@@ -100,17 +99,23 @@ def build_segment(
     """
     name, path = f"sim-rendered-{number}", Path(real_root) / rall.POSES_PATH / f"pose_xy_{number}.txt"
     own = {
-        "start": "2019-01-10T12:00:00", "seed": zlib.crc32(str(number).encode()), "sweeps": "none", **STREET, **changes,
-        "poses": number, "first_scan": int(first_scan), "scans": int(n_scans),
-    }  # fmt: skip
+        "start": "2019-01-10T12:00:00",
+        "seed": zlib.crc32(str(number).encode()),
+        "sweeps": "none",
+        **STREET,
+        **changes,
+        "poses": number,
+        "first_scan": int(first_scan),
+        "scans": int(n_scans),
+    }
     section = {"world": "route", "seed": int(seed), "real_root": str(real_root), "sessions": {name: own}}
     return build_session(parse_settings(section, str(path)), name)
 
 
-def _translate(session: SimulatedSession, network: TrainedNetwork, **how: Any) -> Iterator[np.ndarray]:
+def _generate(session: SimulatedSession, network: TrainedNetwork, **how: Any) -> Iterator[np.ndarray]:
     for index, twist in enumerate(true_twists(session)):
         scan = make_scan(session, index)
-        yield translate_scan(network, scan.power, scan.azimuths, tuple(twist), **how)[0]
+        yield generate_points(network, scan.power, scan.azimuths, tuple(twist), **how)[0]
 
 
 def true_twists(session: SimulatedSession) -> np.ndarray:
@@ -127,7 +132,7 @@ def true_twists(session: SimulatedSession) -> np.ndarray:
         vx, vy, yaw rate [m/s, m/s, rad/s].
     """
     first, middles = session.scans_us, session.scans_us + session.turns_us // 2
-    poses = session.drive.pose(middles)
+    poses = session.trajectory.pose(middles)
     steps = np.zeros((len(poses) - 1, 6))
     steps[:, [0, 1, 5]] = relative_pose(poses[:-1], poses[1:])
     return estimate_twists(RadarOdometry(middles[1:], middles[:-1], first[1:], first[:-1], steps))

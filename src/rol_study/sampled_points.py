@@ -19,7 +19,6 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from numba import prange
 from scipy.spatial import cKDTree
 
 from rol.compiled import compiled
@@ -151,13 +150,9 @@ def find_visible_points(
     occupied[cells[:, 0], cells[:, 1]] = 1
     places = np.column_stack([(poses[:, :2] - corner) / cell, poses[:, 2]])
     reach, depth = max_range_m / cell, depth_m / cell
-    seen = [
-        _cast_all(occupied, part, n_beams, reach, n_surfaces, depth)
-        for part in np.array_split(places, max(len(places) // 500, 1))
-    ]
-    points = np.concatenate([np.concatenate(part) for part in seen]) * cell * 100.0
-    counts = [len(one) for part in seen for one in part]
-    return VisiblePoints(np.rint(points).astype(np.int16), np.cumsum([0, *counts]))
+    seen = [_cast(occupied, u, v, yaw, n_beams, reach, n_surfaces, depth) for u, v, yaw in places]
+    points = [np.rint(points * cell * 100.0).astype(np.int16) for points in seen]
+    return VisiblePoints(np.concatenate(points), np.cumsum([0, *map(len, points)]))
 
 
 @compiled
@@ -191,16 +186,6 @@ def _cast(occupied, u0, v0, yaw, n_beams, reach, n_surfaces, depth):
         u, v = cells[k] // w + 0.5 - u0, cells[k] % w + 0.5 - v0
         points[k, 0], points[k, 1] = c * u + s * v, c * v - s * u
     return points
-
-
-@compiled(parallel=True)
-def _cast_all(occupied, places, n_beams, reach, n_surfaces, depth):
-    """Do this from many places."""
-    seen = [np.empty((0, 2))] * len(places)
-    for k in prange(len(places)):
-        u, v, yaw = places[k]
-        seen[k] = _cast(occupied, u, v, yaw, n_beams, reach, n_surfaces, depth)
-    return seen
 
 
 def solve_mixture(shares: np.ndarray, share_1m: float, share_2m: float) -> np.ndarray:
@@ -332,12 +317,14 @@ def sample_points(
         standing = _renew(standing, pose, n_kept - n_kept // 2, front_end, rng)
         riding = _renew(riding, np.zeros(3), n_kept // 2, front_end, rng)
         again = np.concatenate([transform_points(invert(pose), standing), riding])
-        yield np.concatenate([
-            _draw_near(seen, near, front_end, rng),
-            _draw_beside(seen, beside, pose, tree, rng),
-            again + rng.normal(0.0, 0.1, again.shape),
-            _draw_anywhere(false - n_kept, front_end, rng),
-        ])  # fmt: skip
+        yield np.concatenate(
+            [
+                _draw_near(seen, near, front_end, rng),
+                _draw_beside(seen, beside, pose, tree, rng),
+                again + rng.normal(0.0, 0.1, again.shape),
+                _draw_anywhere(false - n_kept, front_end, rng),
+            ]
+        )
 
 
 def _draw_near(seen: np.ndarray, n: int, front_end: FrontEnd, rng: np.random.Generator) -> np.ndarray:

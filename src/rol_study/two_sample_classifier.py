@@ -13,7 +13,7 @@ from itertools import pairwise
 import numpy as np
 from scipy.stats import rankdata
 
-from rol_study.radar_statistics import MEASURED_RANGE_RESOLUTION
+from rol.radar import MEASURED
 
 ROWS, BINS = 16, 64  # size of a patch
 
@@ -140,9 +140,7 @@ def auc_by_group(
         in the patch. 0.5 where it cannot tell.
     """
     peaks = np.stack([cut_patches(real), cut_patches(simulated)]).max(axis=(-1, -2))
-    range_m = np.broadcast_to(
-        (np.arange(peaks.shape[3]) + 0.5) * BINS * MEASURED_RANGE_RESOLUTION, peaks.shape
-    )
+    range_m = np.broadcast_to((np.arange(peaks.shape[3]) + 0.5) * BINS * MEASURED.resolution_m, peaks.shape)
     found: dict[str, dict[str, float]] = {}
     cases = (
         ("range", range_m, (0, 3, 10, 25, 50, 80, 110, 170)),
@@ -165,11 +163,20 @@ def _train(patches: np.ndarray, rng: np.random.Generator, epochs: int, bf16: boo
 
     torch.manual_seed(int(rng.integers(2**31)))
     classifier = nn.Sequential(
-        nn.Conv2d(1, 16, 5, padding=2), nn.MaxPool2d(2), nn.ReLU(),  # on a quarter of the values
-        nn.Conv2d(16, 32, 3, padding=1), nn.MaxPool2d(2), nn.ReLU(),
-        nn.Conv2d(32, 48, 3, padding=1), nn.ReLU(), nn.AdaptiveAvgPool2d(1), nn.Flatten(),
-        nn.Linear(48, 32), nn.ReLU(), nn.Linear(32, 1),
-    ).to(memory_format=torch.channels_last)  # fmt: skip
+        nn.Conv2d(1, 16, 5, padding=2),
+        nn.MaxPool2d(2),
+        nn.ReLU(),  # on a quarter of the values
+        nn.Conv2d(16, 32, 3, padding=1),
+        nn.MaxPool2d(2),
+        nn.ReLU(),
+        nn.Conv2d(32, 48, 3, padding=1),
+        nn.ReLU(),
+        nn.AdaptiveAvgPool2d(1),
+        nn.Flatten(),
+        nn.Linear(48, 32),
+        nn.ReLU(),
+        nn.Linear(32, 1),
+    ).to(memory_format=torch.channels_last)
     flat = patches.reshape(2, -1, 1, ROWS, BINS)
     images = torch.from_numpy(flat.reshape(-1, 1, ROWS, BINS))
     labels = torch.cat([torch.ones(flat.shape[1]), torch.zeros(flat.shape[1])])

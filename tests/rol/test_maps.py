@@ -87,7 +87,7 @@ def test_register_maps_finds_the_offset_from_zero(offset):
     target = street_map(rng)
     source = transform_points(invert(offset), target) + rng.normal(0.0, 0.05, target.shape)
     registration = register_maps(source, target)
-    assert registration.converged and registration.share_1m == 1.0 and registration.median_m < 0.1
+    assert registration.converged and registration.fraction_1m == 1.0 and registration.median_m < 0.1
     np.testing.assert_allclose(registration.T_target_source, offset, atol=0.05)
     assert [stage[0] for stage in registration.stages] == [100.0, 200.0, np.inf, np.inf]
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from rol.similarity import distance_histogram, nn_distances, share_within, similarity_summary
+from rol.similarity import distance_histogram, fraction_within, nn_distances, similarity_summary
 
 FAKE = np.array([[0.0, 0.0], [3.0, 0.0], [10.0, 0.0]])
 REAL = np.array([[0.0, 0.5], [3.0, 1.5]])
@@ -22,10 +22,10 @@ def test_distances_agree_with_all_pairs():
 
 def test_shares_count_below_the_radius():
     distances = np.array([0.5, 1.0, 1.5, np.inf])
-    assert share_within(distances, 1.0) == 0.25
-    assert share_within(distances, 2.0) == 0.75
+    assert fraction_within(distances, 1.0) == 0.25
+    assert fraction_within(distances, 2.0) == 0.75
     with pytest.raises(ValueError, match="value 1 is nan"):
-        share_within(np.array([0.0, np.nan]), 1.0)
+        fraction_within(np.array([0.0, np.nan]), 1.0)
 
 
 def test_histogram_keeps_every_distance():

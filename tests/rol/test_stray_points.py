@@ -8,10 +8,11 @@ import pytest
 
 from rol.geometry import check_grid
 from rol.maps import MapError, load_map, save_map
-from rol.mcl import MclError, MclSettings, build_distance_grid, build_grid, build_matched_grid, stamp_grid
-from rol_beyond.motion import MotionModel, mover
-from rol_beyond.recovery import RecoverySettings, localize_with_recovery
-from rol_beyond.search import search_poses
+from rol.mcl import MclError, Measurement, build_matched_grid, tabulate_distances
+from rol_beyond.likelihood_field import build_likelihood_field
+from rol_beyond.recovery import RecoveringFilter, RecoverySettings
+from rol_beyond.robust import settings_for
+from rol_beyond.search import SearchSettings, search_poses
 from rol_sim.world.mapped import classify_cells
 from rol_study.sampled_points import SampledPointsError, find_visible_points
 
@@ -25,21 +26,12 @@ TOLD = r"map: points from x -[45]\d\S* to 1e\+06 m and y -1e\+06 to \S+ m; 1 of 
     "build",
     [
         build_matched_grid,
-        build_distance_grid,
-        lambda points: build_grid(points, MclSettings()),
+        build_likelihood_field,
+        Measurement().build_grid,
         lambda points: find_visible_points(points, np.zeros((1, 3))),
         classify_cells,
-        lambda points: next(
-            localize_with_recovery(
-                [],
-                [STREET],
-                points,
-                np.zeros(3),
-                MclSettings(),
-                RecoverySettings(0.2),
-                mover(MotionModel()),
-                RNG,
-            )
+        lambda points: RecoveringFilter(
+            points, np.zeros(3), settings_for("robust"), RecoverySettings(0.2), RNG
         ),
     ],
 )
@@ -56,9 +48,9 @@ def test_narrow_map_that_is_far_too_long_is_refused() -> None:
 
 
 def test_cloud_with_a_stray_point_is_refused_by_the_search() -> None:
-    grid = build_distance_grid(STREET)
+    grid = build_likelihood_field(STREET)
     with pytest.raises(ValueError, match=r"^cloud: points from .*; 1 of 201 lie far .* GiB"):
-        search_poses(STRAY, grid, grid, np.zeros(3), 5.0)
+        search_poses(STRAY, grid, grid, np.zeros(3), SearchSettings(5.0))
 
 
 def test_map_file_with_a_stray_point_is_named(tmp_path: Path) -> None:
@@ -86,4 +78,4 @@ def test_size_of_a_grid_counts_its_bytes() -> None:
 )
 def test_lengths_of_a_grid_must_be_above_zero(cell: float, reach: float) -> None:
     with pytest.raises(MclError, match="must be above zero"):
-        stamp_grid(STREET, cell, reach, np.ones(1, dtype=np.uint8))
+        tabulate_distances(STREET, cell, reach, np.ones(1, dtype=np.uint8))

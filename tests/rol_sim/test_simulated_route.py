@@ -1,4 +1,4 @@
-"""The world grown from a map and the drive along given poses, on a small map of known things."""
+"""The world grown from a map and the trajectory along given poses, on a small map of known things."""
 
 import hashlib
 import os
@@ -154,34 +154,36 @@ def test_pieces_have_the_heights_and_materials_of_their_kind() -> None:
     np.testing.assert_array_equal(part.vertices[part.triangles], mesh.vertices[own])
 
 
-# ---- the drive ----
+# ---- the trajectory ----
 
 
 def test_drive_goes_through_the_poses_and_stands_where_they_stand() -> None:
     poses, stamps = drive_poses(), 10**15 + 250_000 * np.arange(12)
-    drive = recorded_poses.interpolate_trajectory(stamps, poses)
-    np.testing.assert_allclose(drive.pose(stamps), poses, atol=1e-3)
-    assert np.abs(drive.speeds[(drive.stamps_us < stamps[2])]).max() < 0.3
-    np.testing.assert_allclose(drive.velocity(stamps[9:10])[0], (poses[10] - poses[8])[:2] / 0.5, atol=0.15)
-    assert drive.stamps_us[0] == stamps[0] - 1_000_000
+    trajectory = recorded_poses.interpolate_trajectory(stamps, poses)
+    np.testing.assert_allclose(trajectory.pose(stamps), poses, atol=1e-3)
+    assert np.abs(trajectory.speeds[(trajectory.stamps_us < stamps[2])]).max() < 0.3
+    np.testing.assert_allclose(
+        trajectory.velocity(stamps[9:10])[0], (poses[10] - poses[8])[:2] / 0.5, atol=0.15
+    )
+    assert trajectory.stamps_us[0] == stamps[0] - 1_000_000
 
 
 def test_nobody_stands_or_drives_in_the_way() -> None:
     n = 400
     poses = np.column_stack([2.0 * np.arange(n), np.zeros(n), np.zeros(n)])
     stamps = 10**15 + 250_000 * np.arange(n)
-    drive, rng = recorded_poses.interpolate_trajectory(stamps, poses), np.random.default_rng(2)
+    trajectory, rng = recorded_poses.interpolate_trajectory(stamps, poses), np.random.default_rng(2)
     taken = np.column_stack(
         [np.arange(0.0, 400.0, 0.5), np.full(800, 2.4)]
     )  # no room at the first kerb there
-    parked = recorded_poses.park_vehicles(drive, taken, rng, parked_share=1.0, first_object=50)
+    parked = recorded_poses.park_vehicles(trajectory, taken, rng, parked_share=1.0, first_object=50)
     x, y = parked.vertices[:, 0], parked.vertices[:, 1]
     assert np.abs(y).min() > 1.1 and not ((y > 0.0) & (x > 5.0) & (x < 395.0)).any()
     assert parked.objects.min() == 50 and len(np.unique(parked.objects)) > 100
-    traffic = recorded_poses.plan_encounters(drive, rng, vehicles_per_min=20, people_per_min=10)
+    traffic = recorded_poses.plan_encounters(trajectory, rng, vehicles_per_min=20, people_per_min=10)
     met = 0
     for stamp in stamps[::4]:
-        own = drive.pose(np.array([stamp]))[0]
+        own = trajectory.pose(np.array([stamp]))[0]
         numbers, there, velocities = traffic.bodies_at(stamp, own, 12.0)
         met += len(numbers)
         assert np.hypot(*velocities.T).max(initial=0.0) < 20.0
@@ -191,7 +193,7 @@ def test_nobody_stands_or_drives_in_the_way() -> None:
             assert apart[0] > 2.2 + size[0] - 0.5 or apart[1] > 0.9 + size[1] - 0.4
     assert met > 20
     assert len(traffic.bodies_at(stamps[0] - 60_000_000, poses[0])[0]) == 0
-    quiet = recorded_poses.plan_encounters(drive, rng, vehicles_per_min=0, people_per_min=0)
+    quiet = recorded_poses.plan_encounters(trajectory, rng, vehicles_per_min=0, people_per_min=0)
     assert len(quiet.bodies_at(stamps[100], poses[100], 8.0)[0]) == 0
 
 
@@ -294,5 +296,7 @@ def test_twins_stand_where_the_real_scans_stood(real_root: Path) -> None:
     twins = build_twins(real_root, seed=2)
     known = rall.load_scan_poses(rall.find_scan_poses(real_root))
     np.testing.assert_array_equal(twins.scans_us, list(known))
-    np.testing.assert_allclose(twins.drive.pose(twins.scans_us + 125_000), list(known.values()), atol=1e-4)
+    np.testing.assert_allclose(
+        twins.trajectory.pose(twins.scans_us + 125_000), list(known.values()), atol=1e-4
+    )
     assert make_scan(twins, 0).stamp_us == twins.scans_us[0]

@@ -287,7 +287,7 @@ def test_points_of_scan_and_sweep_lie_on_the_town(folder: Path, recipe: Path) ->
     points, materials = label_sweep(folder, "velodyne_right", stamp)
     T_radar_lidar = np.linalg.inv(oxford.EXTRINSICS["radar"]) @ oxford.EXTRINSICS["velodyne_right"]
     in_radar = points[:, :3] @ T_radar_lidar[:3, :3].T + T_radar_lidar[:3, 3]
-    pose = session.drive.pose(np.array([stamp + 25_000]))[0]
+    pose = session.trajectory.pose(np.array([stamp + 25_000]))[0]
     at = transform_points(pose, in_radar[materials == Material.FACADE, :2])
     gaps = []
     for footprint in session.town.footprints:

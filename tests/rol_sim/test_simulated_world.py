@@ -1,4 +1,4 @@
-"""The simulated town: rays against bodies worked out by hand, rules that every town keeps, the drive, the lidar."""
+"""The simulated town: rays against bodies worked out by hand, rules that every town keeps, the trajectory, the lidar."""
 
 import numpy as np
 import pytest
@@ -29,7 +29,7 @@ def town() -> world.Town:
 
 
 @pytest.fixture(scope="module")
-def drive(town: world.Town):
+def trajectory(town: world.Town):
     return plan_trajectory(build_route(town.plan), STAMP, 40.0, np.random.default_rng(5))
 
 
@@ -244,7 +244,7 @@ def test_sessions_dress_the_town_differently(town: world.Town) -> None:
     assert 0.45 < ratio < 0.55
 
 
-# ---- the drive ----
+# ---- the trajectory ----
 
 
 def test_route_is_closed_and_smooth(town: world.Town) -> None:
@@ -260,24 +260,26 @@ def test_route_is_closed_and_smooth(town: world.Town) -> None:
     np.testing.assert_allclose(np.linalg.norm(left[:, :2] - route.place(s, 0.0)[:, :2], axis=1), 2.0)
 
 
-def test_drive_obeys_physics(town: world.Town, drive) -> None:
+def test_drive_obeys_physics(town: world.Town, trajectory) -> None:
     dt = 0.005
-    assert drive.stamps_us[0] == STAMP - 1_000_000 and drive.stamps_us[-1] >= STAMP + 41_000_000
+    assert trajectory.stamps_us[0] == STAMP - 1_000_000 and trajectory.stamps_us[-1] >= STAMP + 41_000_000
     assert (
-        drive.speeds[0] == 0.0 and np.abs(drive.speeds[: int(1.5 / dt)]).max() < 0.05
+        trajectory.speeds[0] == 0.0 and np.abs(trajectory.speeds[: int(1.5 / dt)]).max() < 0.05
     )  # stands at the start
-    assert drive.speeds.min() > -1e-6 and 7.0 < drive.speeds.max() < 10.0
-    acceleration = np.gradient(drive.speeds, dt)
+    assert trajectory.speeds.min() > -1e-6 and 7.0 < trajectory.speeds.max() < 10.0
+    acceleration = np.gradient(trajectory.speeds, dt)
     assert acceleration.min() > -1.9 and acceleration.max() < 1.5
-    step = np.diff(drive.poses, axis=0)
+    step = np.diff(trajectory.poses, axis=0)
     forward = np.hypot(step[:, 0], step[:, 1])
-    np.testing.assert_allclose(forward.sum(), np.sum(drive.speeds[:-1] * dt), rtol=1e-3)
+    np.testing.assert_allclose(forward.sum(), np.sum(trajectory.speeds[:-1] * dt), rtol=1e-3)
     moving = forward > 0.01
     direction = np.arctan2(step[moving, 1], step[moving, 0])
-    slip = (direction - drive.poses[:-1][moving, 2] + np.pi) % (2 * np.pi) - np.pi
+    slip = (direction - trajectory.poses[:-1][moving, 2] + np.pi) % (2 * np.pi) - np.pi
     assert np.abs(slip).max() < 0.02  # the car goes where it points
-    assert np.abs(drive.speeds[:-1][moving] * step[moving, 2] / dt).max() < 2.6  # lateral acceleration
-    assert town.plan.clearance(drive.poses[:, :2]).max() < -1.5  # half a car's width and more from the kerb
+    assert np.abs(trajectory.speeds[:-1][moving] * step[moving, 2] / dt).max() < 2.6  # lateral acceleration
+    assert (
+        town.plan.clearance(trajectory.poses[:, :2]).max() < -1.5
+    )  # half a car's width and more from the kerb
 
 
 def test_drive_stops_on_the_way(town: world.Town) -> None:
@@ -299,25 +301,25 @@ def test_sessions_start_a_few_metres_apart(town: world.Town) -> None:
     assert offsets.min() >= 1.0 and offsets.max() <= 4.0
 
 
-def test_drive_interpolates_and_refuses_times_outside(drive) -> None:
-    middle = drive.pose(np.array([drive.stamps_us[4000] + 2_500]))[0]
-    np.testing.assert_allclose(middle[:2], drive.poses[4000:4002, :2].mean(axis=0), atol=1e-9)
-    velocity = drive.velocity(drive.stamps_us[4000:4001])[0]
-    np.testing.assert_allclose(np.hypot(*velocity), drive.speeds[4000])
-    with pytest.raises(ValueError, match="lies outside the drive"):
-        drive.pose(np.array([drive.stamps_us[-1] + 1]))
+def test_drive_interpolates_and_refuses_times_outside(trajectory) -> None:
+    middle = trajectory.pose(np.array([trajectory.stamps_us[4000] + 2_500]))[0]
+    np.testing.assert_allclose(middle[:2], trajectory.poses[4000:4002, :2].mean(axis=0), atol=1e-9)
+    velocity = trajectory.velocity(trajectory.stamps_us[4000:4001])[0]
+    np.testing.assert_allclose(np.hypot(*velocity), trajectory.speeds[4000])
+    with pytest.raises(ValueError, match="lies outside the trajectory"):
+        trajectory.pose(np.array([trajectory.stamps_us[-1] + 1]))
     route = Route(np.zeros((4, 2)), 1.0, np.zeros(0))
     with pytest.raises(ValueError, match="must be positive"):
         plan_trajectory(route, STAMP, -1.0, np.random.default_rng(0))
 
 
-def test_nobody_drives_through_the_car(town: world.Town, drive) -> None:
+def test_nobody_drives_through_the_car(town: world.Town, trajectory) -> None:
     cars = traffic.plan_traffic(
-        town.plan, build_route(town.plan), drive, np.random.default_rng(8), n_vehicles=14, n_people=5
+        town.plan, build_route(town.plan), trajectory, np.random.default_rng(8), n_vehicles=14, n_people=5
     )
     assert len(cars.meshes) == 19
     for stamp in range(STAMP, STAMP + 40_000_000, 200_000):
-        own = drive.pose(np.array([stamp]))[0]
+        own = trajectory.pose(np.array([stamp]))[0]
         numbers, poses, _ = cars.bodies_at(stamp, own)
         assert len(numbers) == 19
         for mesh, pose in zip(cars.meshes, poses, strict=True):
@@ -330,7 +332,7 @@ def test_nobody_drives_through_the_car(town: world.Town, drive) -> None:
     everyone = cars.meshes_at(town.plan.ground, STAMP, 1000, np.zeros(2), radius=1e4)
     assert set(near.objects) < set(everyone.objects) == set(range(1000, 1019))
     nobody = traffic.plan_traffic(
-        town.plan, build_route(town.plan), drive, np.random.default_rng(8), n_vehicles=0, n_people=0
+        town.plan, build_route(town.plan), trajectory, np.random.default_rng(8), n_vehicles=0, n_people=0
     )
     assert len(nobody.meshes_at(town.plan.ground, STAMP, 0, np.zeros(2)).triangles) == 0
 

@@ -404,7 +404,10 @@ def workplace(tmp_path: Path) -> Path:
 
 def test_generated_images_take_the_network_and_options_of_chapter_05() -> None:
     config = chapters.load_config(ROOT / "config/smoke.yaml")
-    default = {"weights": "data/weights/rol.safetensors", "options": "--threshold=0 --device=cpu --bf16=auto"}
+    default = {
+        "weights": "data/weights/unet.safetensors",
+        "options": "--threshold=0 --device=cpu --bf16=auto",
+    }
     assert chapters.translation(config) == default
     config["notebooks"]["05_real_vs_fake"] |= {"network": "chapter 04", "bf16": False, "device": "cuda"}
     assert chapters.translation(config) == {

@@ -384,7 +384,7 @@ def test_only_captions_of_the_sessions_are_completed(caption: str, data: str, co
     assert notebook.cells[0].metadata.mystnb.figure.caption == completed
 
 
-@pytest.mark.parametrize("metadata", [{}, {"data": "virtual"}])
+@pytest.mark.parametrize("metadata", [{}, {"data": "simulated"}])
 def test_figure_that_does_not_state_its_data_is_refused(metadata: dict) -> None:
     notebook = nbformat.v4.new_notebook(cells=[figure_cell("Errors.", **metadata)])
     with pytest.raises(ChapterError, match="figure fig-a: `data` .* none of session, real, simulated, both"):

@@ -1,4 +1,4 @@
-"""A drive along given poses, and who is met on the way: parked, oncoming, leading and following vehicles.
+"""A trajectory along given poses, and who is met on the way: parked, oncoming, leading and following vehicles.
 
 The poses are those of a real session, 4 a second; between them the car moves smoothly. World frame: that of
 the poses (x, y, yaw) [m, m, rad].
@@ -10,7 +10,7 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.spatial import cKDTree
 
-from rol_sim.drive.town_loop import POSE_STEP_US, Drive
+from rol_sim.drive.town_loop import POSE_STEP_US, Trajectory
 from rol_sim.drive.traffic import TRACK_STEP_US, Traffic
 from rol_sim.world.mesh import Mesh, merge_meshes, move_mesh
 from rol_sim.world.vehicles import (
@@ -22,14 +22,14 @@ from rol_sim.world.vehicles import (
     draw_kind,
 )
 
-MARGIN_US = 1_000_000  # the drive begins so long before the first scan and ends so long after the last
+MARGIN_US = 1_000_000  # the trajectory begins so long before the first scan and ends so long after the last
 LANE_M = 3.2  # from the middle of one lane to that of the other; oncoming traffic is on the right
 KERB_M = 2.6  # from the middle of the lane to a vehicle parked at the left kerb
 SLOT_M = 6.3
 CATALOGUE = 24  # so many different vehicles drive about
 
 
-def interpolate_trajectory(stamps_us: np.ndarray, poses: np.ndarray) -> Drive:
+def interpolate_trajectory(stamps_us: np.ndarray, poses: np.ndarray) -> Trajectory:
     """Drive smoothly through given poses.
 
     Parameters
@@ -41,7 +41,7 @@ def interpolate_trajectory(stamps_us: np.ndarray, poses: np.ndarray) -> Drive:
 
     Returns
     -------
-    drive : Drive
+    trajectory : Trajectory
         200 poses a second, from one second before the first pose to one second after the last; there the car
         goes on as it went.
     """
@@ -56,25 +56,25 @@ def interpolate_trajectory(stamps_us: np.ndarray, poses: np.ndarray) -> Drive:
     dense = spline(inside) + (at - inside)[:, None] * velocity
     speeds = velocity[:, 0] * np.cos(dense[:, 2]) + velocity[:, 1] * np.sin(dense[:, 2])
     progress = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(dense[:, :2], axis=0).T))])
-    return Drive(times, dense, speeds, progress)
+    return Trajectory(times, dense, speeds, progress)
 
 
 class Way:
-    """The line that a drive follows, to be asked by arc length; it goes on straight at both ends.
+    """The line that a trajectory follows, to be asked by arc length; it goes on straight at both ends.
 
     Parameters
     ----------
-    drive : Drive
-        The drive.
+    trajectory : Trajectory
+        The trajectory.
     spacing : float
         Distance between the points kept [m].
     """
 
-    def __init__(self, drive: Drive, spacing: float = 1.0) -> None:
-        n = max(int(drive.progress[-1] / spacing), 1) + 1
-        self.arc = np.linspace(0.0, max(drive.progress[-1], 1e-3), n)
-        index = np.minimum(np.searchsorted(drive.progress, self.arc), len(drive.progress) - 1)
-        self.poses = drive.poses[index]
+    def __init__(self, trajectory: Trajectory, spacing: float = 1.0) -> None:
+        n = max(int(trajectory.progress[-1] / spacing), 1) + 1
+        self.arc = np.linspace(0.0, max(trajectory.progress[-1], 1e-3), n)
+        index = np.minimum(np.searchsorted(trajectory.progress, self.arc), len(trajectory.progress) - 1)
+        self.poses = trajectory.poses[index]
 
     def place(self, s: np.ndarray, offset: np.ndarray | float) -> np.ndarray:
         """Give poses beside the line.
@@ -98,14 +98,19 @@ class Way:
 
 
 def park_vehicles(
-    drive: Drive, taken: np.ndarray, rng: np.random.Generator, *, parked_share: float, first_object: int
+    trajectory: Trajectory,
+    taken: np.ndarray,
+    rng: np.random.Generator,
+    *,
+    parked_share: float,
+    first_object: int,
 ) -> Mesh:
     """Park vehicles at both kerbs, where the map is free and nobody drives.
 
     Parameters
     ----------
-    drive : Drive
-        The drive.
+    trajectory : Trajectory
+        The trajectory.
     taken : array, shape (n, 2)
         Occupied cells of the map [m].
     rng : numpy.random.Generator
@@ -120,7 +125,7 @@ def park_vehicles(
     mesh : Mesh
         The vehicles; empty if there is none.
     """
-    way, meshes = Way(drive), []
+    way, meshes = Way(trajectory), []
     s = np.arange(0.5 * SLOT_M, way.arc[-1], SLOT_M)
     things, lane = cKDTree(taken), cKDTree(way.poses[:, :2])
     for offset in (KERB_M, -LANE_M - KERB_M):
@@ -139,14 +144,14 @@ def park_vehicles(
 
 
 def plan_encounters(
-    drive: Drive, rng: np.random.Generator, *, vehicles_per_min: float, people_per_min: float
+    trajectory: Trajectory, rng: np.random.Generator, *, vehicles_per_min: float, people_per_min: float
 ) -> Traffic:
     """Draw who is met: vehicles that come towards the car, lead or follow it, and people on foot.
 
     Parameters
     ----------
-    drive : Drive
-        The drive.
+    trajectory : Trajectory
+        The trajectory.
     rng : numpy.random.Generator
         Draws everything.
     vehicles_per_min, people_per_min : float
@@ -157,17 +162,17 @@ def plan_encounters(
     traffic : Traffic
         Each body is there while it is near.
     """
-    way, bodies = Way(drive), _draw_catalogue(rng)
+    way, bodies = Way(trajectory), _draw_catalogue(rng)
     walkers = [build_pedestrian(rng) for _ in range(6)]
     movers: list[tuple[Mesh, int, np.ndarray]] = []
-    for stamp in _draw_times(drive, vehicles_per_min, 2.5, rng):
-        movers.append((bodies[int(rng.integers(CATALOGUE))], *_oncoming(drive, way, stamp, rng)))
+    for stamp in _draw_times(trajectory, vehicles_per_min, 2.5, rng):
+        movers.append((bodies[int(rng.integers(CATALOGUE))], *_oncoming(trajectory, way, stamp, rng)))
     for sign in (1.0, -1.0):
-        for begin, end in _draw_spans(drive, rng):
-            track = _same_way(drive, way, begin, end, sign, rng)
+        for begin, end in _draw_spans(trajectory, rng):
+            track = _same_way(trajectory, way, begin, end, sign, rng)
             movers.append((bodies[int(rng.integers(CATALOGUE))], begin, track))
-    for stamp in _draw_times(drive, people_per_min, 0.5, rng):
-        movers.append((walkers[int(rng.integers(6))], *_on_foot(drive, way, stamp, rng)))
+    for stamp in _draw_times(trajectory, people_per_min, 0.5, rng):
+        movers.append((walkers[int(rng.integers(6))], *_on_foot(trajectory, way, stamp, rng)))
     meshes, begins, tracks = zip(*movers, strict=True) if movers else ((), (), ())
     return Traffic(tuple(meshes), np.array(begins, dtype=np.int64), tuple(tracks))
 
@@ -179,58 +184,64 @@ def _draw_catalogue(rng: np.random.Generator) -> list[Mesh]:
     ]
 
 
-def _draw_times(drive: Drive, per_min: float, least_s: float, rng: np.random.Generator) -> np.ndarray:
+def _draw_times(
+    trajectory: Trajectory, per_min: float, least_s: float, rng: np.random.Generator
+) -> np.ndarray:
     """Times of a Poisson process, neighbours at least some seconds apart, shape (n,), int64 [us]."""
     if per_min <= 0.0:
         return np.zeros(0, dtype=np.int64)
-    span_s, gap_s = (drive.stamps_us[-1] - drive.stamps_us[0]) * 1e-6, 60.0 / per_min
+    span_s, gap_s = (trajectory.stamps_us[-1] - trajectory.stamps_us[0]) * 1e-6, 60.0 / per_min
     gaps = least_s + rng.exponential(max(gap_s - least_s, 0.1), int(2 * span_s / gap_s) + 20)
     at = np.cumsum(gaps) - least_s
-    return drive.stamps_us[0] + (at[at < span_s] * 1e6).astype(np.int64)
+    return trajectory.stamps_us[0] + (at[at < span_s] * 1e6).astype(np.int64)
 
 
-def _grid(drive: Drive, begin: float, end: float) -> tuple[np.ndarray, np.ndarray]:
-    """Times every 50 ms within the drive [us], and the car's arc length then [m]."""
-    begin = max(int(begin), int(drive.stamps_us[0]))
-    end = max(min(int(end), int(drive.stamps_us[-1])), begin + 2 * TRACK_STEP_US)
+def _grid(trajectory: Trajectory, begin: float, end: float) -> tuple[np.ndarray, np.ndarray]:
+    """Times every 50 ms within the trajectory [us], and the car's arc length then [m]."""
+    begin = max(int(begin), int(trajectory.stamps_us[0]))
+    end = max(min(int(end), int(trajectory.stamps_us[-1])), begin + 2 * TRACK_STEP_US)
     stamps = np.arange(begin, end, TRACK_STEP_US, dtype=np.int64)
     return stamps, np.interp(
-        stamps - drive.stamps_us[0], drive.stamps_us - drive.stamps_us[0], drive.progress
+        stamps - trajectory.stamps_us[0], trajectory.stamps_us - trajectory.stamps_us[0], trajectory.progress
     )
 
 
-def _oncoming(drive: Drive, way: Way, meet_us: int, rng: np.random.Generator) -> tuple[int, np.ndarray]:
+def _oncoming(
+    trajectory: Trajectory, way: Way, meet_us: int, rng: np.random.Generator
+) -> tuple[int, np.ndarray]:
     speed, offset = float(rng.uniform(5.5, 7.5)), -LANE_M + float(rng.normal(0.0, 0.25))
-    stamps, progress = _grid(drive, meet_us - 20e6, meet_us + 20e6)
+    stamps, progress = _grid(trajectory, meet_us - 20e6, meet_us + 20e6)
     at_meeting = np.interp(meet_us - stamps[0], stamps - stamps[0], progress)
     poses = way.place(at_meeting - speed * (stamps - meet_us) * 1e-6, offset)
     return int(stamps[0]), poses + (0.0, 0.0, np.pi)
 
 
-def _draw_spans(drive: Drive, rng: np.random.Generator) -> list[tuple[int, int]]:
-    """Times during which somebody is there, about half of the drive [us]."""
-    spans, now = [], int(drive.stamps_us[0] - rng.uniform(0.0, 40e6))
-    while now < drive.stamps_us[-1]:
+def _draw_spans(trajectory: Trajectory, rng: np.random.Generator) -> list[tuple[int, int]]:
+    """Times during which somebody is there, about half of the trajectory [us]."""
+    spans, now = [], int(trajectory.stamps_us[0] - rng.uniform(0.0, 40e6))
+    while now < trajectory.stamps_us[-1]:
         end = now + int(rng.uniform(20e6, 60e6))
-        if end > drive.stamps_us[0]:
-            spans.append((max(now, int(drive.stamps_us[0])), end))
+        if end > trajectory.stamps_us[0]:
+            spans.append((max(now, int(trajectory.stamps_us[0])), end))
         now = end + int(rng.uniform(20e6, 60e6))
     return spans
 
 
 def _same_way(
-    drive: Drive, way: Way, begin: int, end: int, sign: float, rng: np.random.Generator
+    trajectory: Trajectory, way: Way, begin: int, end: int, sign: float, rng: np.random.Generator
 ) -> np.ndarray:
     """A vehicle ahead (+1) or behind (-1), 9 m away at least; it comes and goes at 60 m."""
-    stamps, progress = _grid(drive, begin, end)
+    stamps, progress = _grid(trajectory, begin, end)
     along = np.linspace(-1.0, 1.0, len(stamps))
     gap = 9.0 + float(rng.uniform(0.0, 9.0)) + 45.0 * np.abs(along) ** 6
     gap += 1.5 * np.sin((stamps - begin) * 1e-6 / 3.0)
     return way.place(progress + sign * gap, float(rng.normal(0.0, 0.2)))
 
 
-def _on_foot(drive: Drive, way: Way, meet_us: int, rng: np.random.Generator) -> tuple[int, np.ndarray]:
-    stamps, progress = _grid(drive, meet_us - 15e6, meet_us + 15e6)
+def _on_foot(
+    trajectory: Trajectory, way: Way, meet_us: int, rng: np.random.Generator
+) -> tuple[int, np.ndarray]:
+    stamps, progress = _grid(trajectory, meet_us - 15e6, meet_us + 15e6)
     at_meeting = float(np.interp(meet_us - stamps[0], stamps - stamps[0], progress))
     walked = float(rng.choice([-1.3, 0.0, 1.3], p=[0.4, 0.2, 0.4])) * (stamps - meet_us) * 1e-6
     offset = 3.6 + float(rng.uniform(0.0, 1.0)) if rng.random() < 0.6 else -7.0 - float(rng.uniform(0.0, 1.0))

@@ -1,4 +1,4 @@
-"""A drive along the loop: where the radar is at any microsecond.
+"""A trajectory along the loop: where the radar is at any microsecond.
 
 The line keeps to the left of the carriageway, wanders a little and is rounded at corners; the speed respects
 lateral and longitudinal acceleration; the car stands at the start and at some junctions. All in the town
@@ -73,7 +73,7 @@ class Route:
 
 
 @dataclass(frozen=True)
-class Drive:
+class Trajectory:
     """Where the radar is, 200 times a second.
 
     Attributes
@@ -94,7 +94,7 @@ class Drive:
     progress: np.ndarray
 
     def pose(self, query_us: np.ndarray) -> np.ndarray:
-        """Give the poses at any times of the drive.
+        """Give the poses at any times of the trajectory.
 
         Parameters
         ----------
@@ -109,7 +109,7 @@ class Drive:
         Raises
         ------
         ValueError
-            If a time lies outside the drive.
+            If a time lies outside the trajectory.
         """
         t = self._seconds(query_us)
         knots = (self.stamps_us - self.stamps_us[0]) * 1e-6
@@ -117,7 +117,7 @@ class Drive:
         return np.stack([x, y, wrap_angle(yaw)], axis=-1)
 
     def velocity(self, query_us: np.ndarray) -> np.ndarray:
-        """Give the velocities in the town at any times of the drive, shape (m, 2) [m/s]."""
+        """Give the velocities in the town at any times of the trajectory, shape (m, 2) [m/s]."""
         t = self._seconds(query_us)
         speed = np.interp(t, (self.stamps_us - self.stamps_us[0]) * 1e-6, self.speeds)
         yaw = self.pose(query_us)[:, 2]
@@ -128,7 +128,7 @@ class Drive:
         is_outside = (query_us < self.stamps_us[0]) | (query_us > self.stamps_us[-1])
         if is_outside.any():
             span = f"{self.stamps_us[0]} .. {self.stamps_us[-1]}"
-            raise ValueError(f"time {query_us[is_outside][0]} us lies outside the drive, {span} us")
+            raise ValueError(f"time {query_us[is_outside][0]} us lies outside the trajectory, {span} us")
         return (query_us - self.stamps_us[0]) * 1e-6
 
 
@@ -167,7 +167,7 @@ def plan_trajectory(
     cruise_mps: float = 7.5,
     n_stops: int = 2,
     stand_s: float = 1.5,
-) -> Drive:
+) -> Trajectory:
     """Drive along the route.
 
     Parameters
@@ -175,9 +175,9 @@ def plan_trajectory(
     route : Route
         The route.
     first_stamp_us : int
-        Time of the first radar scan [us]; the drive begins one second before it.
+        Time of the first radar scan [us]; the trajectory begins one second before it.
     duration_s : float
-        Time from the first scan to the end of the last; the drive ends one second after it [s].
+        Time from the first scan to the end of the last; the trajectory ends one second after it [s].
     rng : numpy.random.Generator
         Draws wander, start offset, speed changes and where the car stops.
     start_m : float
@@ -191,7 +191,7 @@ def plan_trajectory(
 
     Returns
     -------
-    drive : Drive
+    trajectory : Trajectory
         Truth at 200 Hz.
 
     Raises
@@ -220,7 +220,7 @@ def plan_trajectory(
     speeds, travelled = np.gradient(travelled, POSE_STEP_US * 1e-6)[:count], travelled[:count]
     poses = np.stack([np.interp(travelled, along, v) for v in (line[:, 0], line[:, 1], yaw)], axis=-1)
     stamps = first_stamp_us - 1_000_000 + POSE_STEP_US * np.arange(count, dtype=np.int64)
-    return Drive(stamps, poses, speeds, np.interp(travelled, along, s))
+    return Trajectory(stamps, poses, speeds, np.interp(travelled, along, s))
 
 
 def _space_evenly(points: np.ndarray, spacing: float) -> tuple[np.ndarray, float]:

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from rol.geometry import wrap_angle
-from rol_sim.drive.town_loop import Drive, Route
+from rol_sim.drive.town_loop import Route, Trajectory
 from rol_sim.world.mesh import Mesh, merge_meshes, move_mesh
 from rol_sim.world.streets import StreetPlan
 from rol_sim.world.vehicles import MOVING_KINDS, build_cyclist, build_pedestrian, build_vehicle, draw_kind
@@ -106,16 +106,18 @@ class Traffic:
         """
         numbers, poses, _ = self.bodies_at(stamp_us, middle, radius)
         heights = ground(poses[:, :2])
-        return merge_meshes([
-            move_mesh(self.meshes[i], pose, h, first_object + int(i))
-            for i, pose, h in zip(numbers, poses, heights, strict=True)
-        ])  # fmt: skip
+        return merge_meshes(
+            [
+                move_mesh(self.meshes[i], pose, h, first_object + int(i))
+                for i, pose, h in zip(numbers, poses, heights, strict=True)
+            ]
+        )
 
 
 def plan_traffic(
     plan: StreetPlan,
     route: Route,
-    drive: Drive,
+    trajectory: Trajectory,
     rng: np.random.Generator,
     *,
     n_vehicles: int = 16,
@@ -129,8 +131,8 @@ def plan_traffic(
         The streets.
     route : Route
         The loop; its traffic comes towards the car, leads or follows it.
-    drive : Drive
-        The car's own drive, so that nobody drives through it.
+    trajectory : Trajectory
+        The car's own trajectory, so that nobody drives through it.
     rng : numpy.random.Generator
         Draws everything.
     n_vehicles, n_people : int
@@ -141,13 +143,15 @@ def plan_traffic(
     traffic : Traffic
         Who else is on the move.
     """
-    stamps = np.arange(drive.stamps_us[0], drive.stamps_us[-1] + TRACK_STEP_US, TRACK_STEP_US, dtype=np.int64)
+    stamps = np.arange(
+        trajectory.stamps_us[0], trajectory.stamps_us[-1] + TRACK_STEP_US, TRACK_STEP_US, dtype=np.int64
+    )
     seconds = (stamps - stamps[0]) * 1e-6
     n_oncoming = round(0.55 * n_vehicles)
     movers = _oncoming(route, seconds, n_oncoming, rng)
     n_same_way = min(2, n_vehicles - n_oncoming)
     for sign in (1.0, -1.0)[:n_same_way]:
-        movers.append(_same_way(route, drive, stamps, seconds, sign, rng))
+        movers.append(_same_way(route, trajectory, stamps, seconds, sign, rng))
     side_streets = [street for street in plan.streets if not street.on_loop]
     for _ in range(n_vehicles - n_oncoming - n_same_way):
         street = side_streets[int(rng.integers(len(side_streets)))]
@@ -187,10 +191,15 @@ def _oncoming(
 
 
 def _same_way(
-    route: Route, drive: Drive, stamps: np.ndarray, seconds: np.ndarray, sign: float, rng: np.random.Generator
+    route: Route,
+    trajectory: Trajectory,
+    stamps: np.ndarray,
+    seconds: np.ndarray,
+    sign: float,
+    rng: np.random.Generator,
 ) -> tuple[Mesh, np.ndarray]:
     """A vehicle ahead (+1) or behind (-1) in the car's own lane, 13 m away at least and ever farther."""
-    progress = np.interp(stamps - stamps[0], drive.stamps_us - stamps[0], drive.progress)
+    progress = np.interp(stamps - stamps[0], trajectory.stamps_us - stamps[0], trajectory.progress)
     gap = float(rng.uniform(13.0, 20.0)) + float(rng.uniform(0.1, 1.2)) * seconds
     poses = route.place(progress + sign * gap, route.lane_offset)
     return _draw_vehicle(rng), _unwrapped(poses, 0.0)

@@ -16,12 +16,14 @@ from dataclasses import dataclass, field, fields
 import numpy as np
 
 from rol.geometry import check_fields, check_poses
+from rol.oxford import COUNTS_PER_TURN, N_AZIMUTHS
 from rol_sim.sensors.radar_signal import echoes_to_codes, range_to_bins
-from rol_sim.sensors.radar_surfaces import Surface, scatter, surface_table
+from rol_sim.sensors.radar_surfaces import Surface, SurfaceHits, scatter, surface_table
 from rol_sim.world.scene import Scene
 
-N_AZIMUTHS, N_COUNTS, FIRST_COUNT, COUNT_STEP = 400, 5600, 13, 14
-ROW_ANGLE = 2.0 * np.pi * COUNT_STEP / N_COUNTS
+# Encoder counts of the rows: 13, 27, ... 5599 of 5600.
+FIRST_COUNT, COUNT_STEP = 13, 14
+ROW_ANGLE = 2.0 * np.pi * COUNT_STEP / COUNTS_PER_TURN
 MARGIN_ROWS = 5  # the beam's flanks reach this far before the first and after the last row
 WEAKEST_ONWARD = 3.0  # a ray is followed on while a perfect scatterer would return more power than this
 
@@ -135,7 +137,7 @@ def beam_azimuths() -> np.ndarray:
         Counter-clockwise from forward, falling from -0.015 to -6.28 [rad]; the sensor's counters are 13, 27,
         ... 5599.
     """
-    return -2.0 * np.pi * (FIRST_COUNT + COUNT_STEP * np.arange(N_AZIMUTHS)) / N_COUNTS
+    return -2.0 * np.pi * (FIRST_COUNT + COUNT_STEP * np.arange(N_AZIMUTHS)) / COUNTS_PER_TURN
 
 
 def simulate_scan(
@@ -186,9 +188,14 @@ def simulate_scan(
         closing = closing - _look_up_velocities(objects, object_velocities)
     ranges = ranges - settings.doppler_seconds * np.einsum("ij,ij->i", closing, headings)
     return echoes_to_codes(
-        rows, range_to_bins(ranges), powers, rng, noise_scale=settings.noise_scale,
-        streak_scale=settings.streak_scale, interference_rate=settings.interference_rate,
-    )  # fmt: skip
+        rows,
+        range_to_bins(ranges),
+        powers,
+        rng,
+        noise_scale=settings.noise_scale,
+        streak_scale=settings.streak_scale,
+        interference_rate=settings.interference_rate,
+    )
 
 
 def emit_rays(row_poses: np.ndarray, rng: np.random.Generator, settings: RadarSettings) -> Rays:
@@ -215,7 +222,7 @@ def emit_rays(row_poses: np.ndarray, rng: np.random.Generator, settings: RadarSe
     elevations = np.deg2rad(np.array(settings.layers_deg) + (jitter[1] - 0.5) * settings.layer_widths_deg)
     at, knots = np.clip(rows, 0.0, N_AZIMUTHS - 1.0), np.arange(N_AZIMUTHS)
     x, y, yaw = (np.interp(at, knots, values) for values in (*row_poses[:, :2].T, np.unwrap(row_poses[:, 2])))
-    angle = yaw - (FIRST_COUNT + COUNT_STEP * rows) * 2.0 * np.pi / N_COUNTS
+    angle = yaw - (FIRST_COUNT + COUNT_STEP * rows) * 2.0 * np.pi / COUNTS_PER_TURN
     flat = np.cos(elevations)
     direction = np.stack([flat * np.cos(angle), flat * np.sin(angle), np.sin(elevations)], axis=-1)
     gains = 10.0 ** (np.array(settings.layer_gains_db) / 10.0) * settings.layer_widths_deg
@@ -255,49 +262,58 @@ def trace_echoes(scene: Scene, rays: Rays, settings: RadarSettings) -> tuple[np.
         Object number.
     """
     table, found = surface_table(settings.surfaces), []
-    spacing, haze = ROW_ANGLE / settings.rays_per_row, 10.0 ** (settings.clutter_tail_db / 10.0)
+    ray_spacing = ROW_ANGLE / settings.rays_per_row
+    tail_fraction = 10.0 ** (settings.clutter_tail_db / 10.0)
     for _ in range(settings.transmission_layers + settings.bounces):
-        hits = scene.cast(np.concatenate([rays.origin, rays.direction], axis=1))
-        near = np.flatnonzero(rays.length + hits.t < settings.max_range)
-        rays, t, normals, surfaces = (
-            rays.take(near),
-            hits.t[near],
-            hits.normals[near],
-            table[hits.material[near]],
-        )
-        objects, cosines = hits.object_id[near], hits.cos_incidence[near]
-        points, totals = rays.origin + t[:, None] * rays.direction, rays.length + t
-        weights = rays.weight * (totals / 10.0) ** np.float32(-settings.range_exponent)
-        turns, ranges, powers, sources = scatter(
-            points, rays.direction, normals, cosines, objects, surfaces, rays.heading, totals, weights,
-            rays.bounced == 0, spacing, haze, settings.clutter_tail_m,
-        )  # fmt: skip
-        rows = rays.row[sources] - turns / np.float32(ROW_ANGLE)
-        found.append((rows, ranges, powers, rays.heading[sources, :2], objects[sources]))
-        rays = _go_on(rays, points, totals, weights, normals, surfaces, settings.bounces)
+        rays, hits = _hit_surfaces(scene, rays, table, settings)
+        echoes = scatter(hits, ray_spacing, tail_fraction, settings.clutter_tail_m)
+        source = echoes.sources
+        rows = rays.row[source] - echoes.turns / np.float32(ROW_ANGLE)
+        found.append((rows, echoes.ranges, echoes.powers, rays.heading[source, :2], hits.objects[source]))
+        rays = _follow_rays(rays, hits, settings.bounces)
         if len(rays.row) == 0:
             break
     rows, ranges, powers, headings, objects = (np.concatenate(parts) for parts in zip(*found, strict=True))
     return rows, ranges, powers, headings / np.linalg.norm(headings, axis=1, keepdims=True), objects
 
 
-def _go_on(
-    rays: Rays, points: np.ndarray, totals: np.ndarray, weights: np.ndarray, normals: np.ndarray,
-    surfaces: np.ndarray, bounces: int,
-) -> Rays:  # fmt: skip
-    """Rays that pass through leaves or glass, and mirrored ones; the rest ends."""
-    mirror, passes, strong = surfaces[:, 6], surfaces[:, 7], weights > WEAKEST_ONWARD
+def _hit_surfaces(
+    scene: Scene, rays: Rays, table: np.ndarray, settings: RadarSettings
+) -> tuple[Rays, SurfaceHits]:
+    """Cast rays; returns those that hit something within range, and their hits."""
+    found = scene.cast(np.concatenate([rays.origin, rays.direction], axis=1))
+    near = np.flatnonzero(rays.length + found.t < settings.max_range)
+    rays, t = rays.take(near), found.t[near]
+    ranges = rays.length + t
+    return rays, SurfaceHits(
+        points=rays.origin + t[:, None] * rays.direction,
+        directions=rays.direction,
+        normals=found.normals[near],
+        cosines=found.cos_incidence[near],
+        objects=found.object_id[near],
+        surfaces=table[found.material[near]],
+        headings=rays.heading,
+        ranges=ranges,
+        weights=rays.weight * (ranges / 10.0) ** np.float32(-settings.range_exponent),
+        is_direct=rays.bounced == 0,
+    )
+
+
+def _follow_rays(rays: Rays, hits: SurfaceHits, bounces: int) -> Rays:
+    """Continue rays behind leaves and glass, and mirrored ones; the rest ends."""
+    mirror, passes, strong = hits.surfaces[:, 6], hits.surfaces[:, 7], hits.weights > WEAKEST_ONWARD
+    is_upright = np.abs(hits.normals[:, 2]) < 0.3
     through = np.flatnonzero((passes > 0.0) & strong)
-    back = np.flatnonzero((mirror > 0.0) & strong & (rays.bounced < bounces) & (np.abs(normals[:, 2]) < 0.3))
-    along = np.einsum("ij,ij->i", rays.direction[back], normals[back])
-    turned = rays.direction[back] - 2.0 * along[:, None] * normals[back]
-    onward = rays.take(np.concatenate([through, back]))
-    onward.direction = np.concatenate([rays.direction[through], turned])
-    onward.origin = points[np.concatenate([through, back])] + np.float32(0.02) * onward.direction
-    onward.length = totals[np.concatenate([through, back])]
-    onward.weight *= (
-        np.concatenate([passes[through], mirror[back]]) ** 2
-    )  # lost on the way out and on the way back
+    back = np.flatnonzero((mirror > 0.0) & strong & (rays.bounced < bounces) & is_upright)
+    along = np.einsum("ij,ij->i", rays.direction[back], hits.normals[back])
+    mirrored = rays.direction[back] - 2.0 * along[:, None] * hits.normals[back]
+    both = np.concatenate([through, back])
+    onward = rays.take(both)
+    onward.direction = np.concatenate([rays.direction[through], mirrored])
+    onward.origin = hits.points[both] + np.float32(0.02) * onward.direction
+    onward.length = hits.ranges[both]
+    # Power is lost on the way out and on the way back.
+    onward.weight *= np.concatenate([passes[through], mirror[back]]) ** 2
     onward.bounced[len(through) :] += 1
     return onward
 

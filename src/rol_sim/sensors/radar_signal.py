@@ -12,9 +12,8 @@ from functools import lru_cache
 import numpy as np
 
 from rol.compiled import compiled
-
-N_AZIMUTHS, N_BINS = 400, 3768
-RANGE_RESOLUTION, RANGE_OFFSET = 0.0438, -0.31  # true range = (bin + 0.5) * resolution + offset [m]
+from rol.oxford import N_AZIMUTHS, N_BINS
+from rol.radar import MEASURED
 
 # A Hann window over the chirp, its spectrum padded: one cell of the bare spectrum is this many bins.
 HANN_BINS = 5.9
@@ -103,7 +102,7 @@ def range_to_bins(ranges_m: np.ndarray) -> np.ndarray:
     bins : array, same shape
         Fractional bin, an integer at the middle of a bin.
     """
-    return (ranges_m - RANGE_OFFSET) / RANGE_RESOLUTION - 0.5
+    return (ranges_m - MEASURED.offset_m) / MEASURED.resolution_m - 0.5
 
 
 def range_response(bins: np.ndarray) -> np.ndarray:
@@ -167,7 +166,7 @@ def echoes_to_codes(
     field[:, :, :N_LEAKAGE] += leakage
     add_interference(field, rng, interference_rate)
     codes = np.empty((N_AZIMUTHS, N_BINS), dtype=np.uint8)
-    _finish(field, white, np.sqrt(floor).astype(np.float32), _noise_taps(), _code_table(), codes)
+    _digitize(field, white, np.sqrt(floor).astype(np.float32), _noise_taps(), _code_table(), codes)
     codes[:, : N_COPIES - 1] = codes[:, N_COPIES - 1 : N_COPIES]
     return codes
 
@@ -205,7 +204,7 @@ def _block_energies(field: np.ndarray) -> np.ndarray:
 
 @lru_cache(maxsize=1)
 def _block_noise() -> np.ndarray:
-    ranges = (np.arange(-(-N_BINS // BLOCK)) + 0.5) * BLOCK * RANGE_RESOLUTION
+    ranges = (np.arange(-(-N_BINS // BLOCK)) + 0.5) * BLOCK * MEASURED.resolution_m
     return np.interp(ranges, NOISE_RANGES_M, NOISE_POWERS).astype(np.float32)
 
 
@@ -285,43 +284,66 @@ def _splat(field, rows, bins, amplitudes, phases, response, pattern):  # pragma:
 
 @compiled
 def _saturate(field, response):  # pragma: no cover (compiled)
-    """Bend the receiver: a row's strongest echo is clipped and returns at 2, 3, 5, 7 times its bin."""
-    n_rows, n_bins = field.shape[1], field.shape[2]
-    for row in range(n_rows):
-        top, at = np.float32(2e4), -1
-        for b in range(8, n_bins - 1):
-            power = field[0, row, b] ** 2 + field[1, row, b] ** 2
-            if power > top:
-                top, at = power, b
-        if at < 0:
+    """Clip each row's strongest echo and add its harmonics at 2, 3, 5 and 7 times its bin, in place."""
+    for row in range(field.shape[1]):
+        peak, power = _strongest_bin(field, row)
+        if peak < 0:
             continue
-        size = np.sqrt(top)
-        before = np.hypot(field[0, row, at - 1], field[1, row, at - 1])
-        after = np.hypot(field[0, row, at + 1], field[1, row, at + 1])
-        place = at + 0.5 * (after - before) / max(2.0 * size - before - after, 1e-3)
-        phase = np.arctan2(field[1, row, at], field[0, row, at])
-        half_angle = np.arcsin(min(CLIP_AMPLITUDE / size, 1.0))
-        shrink = 2.0 / np.pi * (half_angle + 0.5 * np.sin(2.0 * half_angle))
-        for b in range(n_bins):
-            field[0, row, b] *= shrink
-            field[1, row, b] *= shrink
+        amplitude = np.sqrt(power)
+        place = _interpolate_peak(field, row, peak, amplitude)
+        phase = np.arctan2(field[1, row, peak], field[0, row, peak])
+        half_angle = np.arcsin(min(CLIP_AMPLITUDE / amplitude, 1.0))
+        gain = 2.0 / np.pi * (half_angle + 0.5 * np.sin(2.0 * half_angle))  # of the clipped fundamental
+        for b in range(field.shape[2]):
+            field[0, row, b] *= gain
+            field[1, row, b] *= gain
         for order in (2, 3, 5, 7):
-            if order == 2:
-                level = SECOND_HARMONIC * (shrink * size) ** 2
-            else:  # Fourier series of a clipped sine
-                swing = np.sin((order - 1) * half_angle) / (order - 1) - np.sin((order + 1) * half_angle) / (
-                    order + 1
-                )
-                clipped = np.cos(order * half_angle) / order * min(CLIP_AMPLITUDE, size)
-                level = 4.0 / np.pi * abs(0.5 * size * swing + clipped)
+            level = _harmonic_amplitude(order, amplitude, gain, half_angle)
             centre = int(np.floor(order * place + 0.5 * (order - 1)))
-            if level < 0.3 or centre + KERNEL_HALF >= n_bins:
-                continue
-            for k in range(-KERNEL_HALF, KERNEL_HALF + 1):
-                if 0 <= centre + k:
-                    weight = level * response[0, k + KERNEL_HALF]
-                    field[0, row, centre + k] += weight * np.cos(order * phase)
-                    field[1, row, centre + k] += weight * np.sin(order * phase)
+            if level >= 0.3:
+                _add_tone(field, row, centre, level, order * phase, response)
+
+
+@compiled
+def _strongest_bin(field, row):  # pragma: no cover (compiled)
+    """Bin and power of a row's strongest echo beyond the leakage; bin -1 if none comes near saturation."""
+    power, peak = np.float32(2e4), -1
+    for b in range(8, field.shape[2] - 1):
+        here = field[0, row, b] ** 2 + field[1, row, b] ** 2
+        if here > power:
+            power, peak = here, b
+    return peak, power
+
+
+@compiled
+def _interpolate_peak(field, row, peak, amplitude):  # pragma: no cover (compiled)
+    """Fractional bin of a peak, from the amplitudes of its two neighbours."""
+    before = np.hypot(field[0, row, peak - 1], field[1, row, peak - 1])
+    after = np.hypot(field[0, row, peak + 1], field[1, row, peak + 1])
+    return peak + 0.5 * (after - before) / max(2.0 * amplitude - before - after, 1e-3)
+
+
+@compiled
+def _harmonic_amplitude(order, amplitude, gain, half_angle):  # pragma: no cover (compiled)
+    """Amplitude of a harmonic: square law for the second, Fourier series of a clipped sine for the odd ones."""
+    if order == 2:
+        return SECOND_HARMONIC * (gain * amplitude) ** 2
+    below = np.sin((order - 1) * half_angle) / (order - 1)
+    above = np.sin((order + 1) * half_angle) / (order + 1)
+    clipped = np.cos(order * half_angle) / order * min(CLIP_AMPLITUDE, amplitude)
+    return 4.0 / np.pi * abs(0.5 * amplitude * (below - above) + clipped)
+
+
+@compiled
+def _add_tone(field, row, centre, level, phase, response):  # pragma: no cover (compiled)
+    """Add the range response of one tone to a row, if it lies within the scan."""
+    if centre + KERNEL_HALF >= field.shape[2]:
+        return
+    for k in range(-KERNEL_HALF, KERNEL_HALF + 1):
+        if centre + k >= 0:
+            weight = level * response[0, k + KERNEL_HALF]
+            field[0, row, centre + k] += weight * np.cos(phase)
+            field[1, row, centre + k] += weight * np.sin(phase)
 
 
 @compiled(fastmath=True)
@@ -336,38 +358,53 @@ def _sum_blocks(field, energies):  # pragma: no cover (compiled)
 
 
 @compiled(fastmath=True)
-def _finish(field, white, floors, taps, table, codes):  # pragma: no cover (compiled)
-    n_groups, n_bins, n_blocks = -(-codes.shape[1] // NOISE_STEP), codes.shape[1], floors.shape[1]
-    noise = np.empty((2, n_groups * NOISE_STEP), dtype=np.float32)
+def _digitize(field, white, floors, taps, table, codes):  # pragma: no cover (compiled)
+    """Add the receiver's noise to the field and write the codes of its power, row by row."""
+    n_bins = codes.shape[1]
+    noise = np.empty((2, -(-n_bins // NOISE_STEP) * NOISE_STEP), dtype=np.float32)
     powers = np.empty(n_bins, dtype=np.float32)
     for row in range(codes.shape[0]):
         for part in range(2):
-            source = white[part, row]
-            for phase in range(NOISE_STEP):
-                a, b, c, d, e, f = taps[phase]
-                for g in range(n_groups):
-                    noise[part, g * NOISE_STEP + phase] = (
-                        a * source[g] + b * source[g + 1] + c * source[g + 2]
-                        + d * source[g + 3] + e * source[g + 4] + f * source[g + 5]
-                    )  # fmt: skip
-        for block in range(n_blocks - 1):
-            size = floors[row, block]
-            slope = (floors[row, block + 1] - size) / np.float32(BLOCK)
-            for k in range(2 * BLOCK if block == n_blocks - 2 else BLOCK):
-                b = block * BLOCK + k
-                if b < n_bins:
-                    here = size + slope * np.float32(k)
-                    real = noise[0, b] * here + field[0, row, b]
-                    imaginary = noise[1, b] * here + field[1, row, b]
-                    powers[b] = min(
-                        real * real + imaginary * imaginary + np.float32(ROUNDING), np.float32(GREATEST)
-                    )
-        for b in range(n_bins):
-            n = int(powers[b])
-            if n < len(table):
-                codes[row, b] = table[n]
-            else:
-                exponent = 12
-                while (n >> exponent) > 1:
-                    exponent += 1
-                codes[row, b] = int(LOG_SCALE * (exponent + n / (1 << exponent) - 1.0) + 0.5)
+            _spread_noise(white[part, row], taps, noise[part])
+        _detect(field[0, row], field[1, row], noise, floors[row], powers)
+        _encode(powers, table, codes[row])
+
+
+@compiled(fastmath=True)
+def _spread_noise(white, taps, noise):  # pragma: no cover (compiled)
+    """Interpolate white noise of every fifth bin, shape (n,), to all bins by the 5 x 6 filter taps."""
+    for phase in range(NOISE_STEP):
+        a, b, c, d, e, f = taps[phase]
+        for g in range(len(noise) // NOISE_STEP):
+            early = a * white[g] + b * white[g + 1] + c * white[g + 2]
+            noise[g * NOISE_STEP + phase] = early + d * white[g + 3] + e * white[g + 4] + f * white[g + 5]
+
+
+@compiled(fastmath=True)
+def _detect(real, imaginary, noise, floors, powers):  # pragma: no cover (compiled)
+    """Power of a row's field with noise, whose amplitude runs linearly between the blocks of 16 bins."""
+    n_bins, n_blocks = len(powers), len(floors)
+    for block in range(n_blocks - 1):
+        floor = floors[block]
+        slope = (floors[block + 1] - floor) / np.float32(BLOCK)
+        for k in range(2 * BLOCK if block == n_blocks - 2 else BLOCK):
+            b = block * BLOCK + k
+            if b < n_bins:
+                amplitude = floor + slope * np.float32(k)
+                x = noise[0, b] * amplitude + real[b]
+                y = noise[1, b] * amplitude + imaginary[b]
+                powers[b] = min(x * x + y * y + np.float32(ROUNDING), np.float32(GREATEST))
+
+
+@compiled(fastmath=True)
+def _encode(powers, table, codes):  # pragma: no cover (compiled)
+    """Codes of powers, as in `power_to_codes`; those of small powers from a table."""
+    for b in range(len(codes)):
+        n = int(powers[b])
+        if n < len(table):
+            codes[b] = table[n]
+        else:
+            exponent = 12
+            while (n >> exponent) > 1:
+                exponent += 1
+            codes[b] = int(LOG_SCALE * (exponent + n / (1 << exponent) - 1.0) + 0.5)

@@ -7,6 +7,7 @@ way, and in the same way whenever it is looked at, so that scans of one place re
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -106,25 +107,10 @@ def surface_table(changed: dict[str, Surface]) -> np.ndarray:
     return table
 
 
-@compiled
-def scatter(
-    points,
-    directions,
-    normals,
-    cosines,
-    objects,
-    surfaces,
-    headings,
-    totals,
-    weights,
-    is_direct,
-    spacing,
-    haze,
-    clutter_tail_m,
-):  # pragma: no cover (compiled)
-    """Turn hits into echoes; between rays that hit a wall farther apart than a cell, every cell answers.
+class SurfaceHits(NamedTuple):
+    """Hits of radar rays on surfaces.
 
-    Parameters
+    Attributes
     ----------
     points, directions, normals : array, shape (n, 3)
         Where rays hit [m], unit directions, unit normals.
@@ -134,69 +120,137 @@ def scatter(
         Rows of `surface_table`.
     headings : array, shape (n, 3)
         Unit direction in which each ray left the radar.
-    totals, weights : array, shape (n,)
-        Length of the way so far [m], power that a perfect scatterer would give.
+    ranges, weights : array, shape (n,)
+        Length of the path so far [m], power that a perfect scatterer would return.
     is_direct : array, shape (n,), bool
         False for rays that were mirrored.
-    spacing : float
-        Angle between neighbouring rays [rad].
-    haze, clutter_tail_m : float
-        Share of power, and mean length [m], of the later echoes that follow a surface.
+    """
 
-    Returns
-    -------
-    turns : array, shape (m,)
+    points: np.ndarray
+    directions: np.ndarray
+    normals: np.ndarray
+    cosines: np.ndarray
+    objects: np.ndarray
+    surfaces: np.ndarray
+    headings: np.ndarray
+    ranges: np.ndarray
+    weights: np.ndarray
+    is_direct: np.ndarray
+
+
+class Echoes(NamedTuple):
+    """Echoes of surface hits.
+
+    Attributes
+    ----------
+    turns : array, shape (m,), float32
         How far to the left of its ray's heading each echo lies [rad].
-    ranges, powers : array, shape (m,)
+    ranges, powers : array, shape (m,), float32
         Range [m] and power.
     sources : array, shape (m,), int32
         Which hit each echo comes from.
     """
-    n = len(totals)
-    turns, ranges = (
-        np.empty(n * (MOST_CELLS + MOST_LATER), dtype=np.float32),
-        np.empty(n * (MOST_CELLS + MOST_LATER), dtype=np.float32),
-    )
-    powers, sources = (
-        np.empty(n * (MOST_CELLS + MOST_LATER), dtype=np.float32),
-        np.empty(n * (MOST_CELLS + MOST_LATER), dtype=np.int32),
+
+    turns: np.ndarray
+    ranges: np.ndarray
+    powers: np.ndarray
+    sources: np.ndarray
+
+
+@compiled
+def scatter(hits, ray_spacing, tail_fraction, tail_m):  # pragma: no cover (compiled)
+    """Compute the echoes of surface hits.
+
+    Where neighbouring rays hit a wall farther apart than a cell, every cell between them answers. Each hit is
+    followed by a clutter tail: weaker echoes at longer ranges.
+
+    Parameters
+    ----------
+    hits : SurfaceHits
+        The hits, n of them.
+    ray_spacing : float
+        Angle between neighbouring rays [rad].
+    tail_fraction, tail_m : float
+        Power of the clutter tail relative to the surface's, and its mean length [m].
+
+    Returns
+    -------
+    echoes : Echoes
+        m echoes, in the order of the hits.
+    """
+    most = len(hits.ranges) * (MOST_CELLS + MOST_LATER)
+    echoes = Echoes(
+        np.empty(most, dtype=np.float32),
+        np.empty(most, dtype=np.float32),
+        np.empty(most, dtype=np.float32),
+        np.empty(most, dtype=np.int32),
     )
     count = 0
-    for i in range(n):
-        number, z = int(objects[i]), int(np.floor(points[i, 2]))
-        nx, ny = normals[i, 0], normals[i, 1]
-        upright = np.hypot(nx, ny)
-        s, half = points[i, 0] + 0.37 * points[i, 1], 0.0
-        if upright > 0.3:
-            nx, ny = nx / upright, ny / upright
-            s = -ny * points[i, 0] + nx * points[i, 1]
-            facing = abs(directions[i, 0] * nx + directions[i, 1] * ny)
-            half = min(0.5 * totals[i] * spacing / max(facing, 0.02), 0.5 * CELL * (MOST_CELLS - 1))
-        middle, together = int(np.floor(s / CELL)), 0.0
-        first, last, share = middle, middle + 1, 1.0
-        is_spread = is_direct[i] and 2.0 * half > CELL
+    for i in range(len(hits.ranges)):
+        nx, ny, along, half = _footprint(hits, i, ray_spacing)
+        count, power = _scatter_cells(hits, i, (nx, ny, along, half), echoes, count)
+        if power * tail_fraction > WEAKEST:
+            count = _add_clutter_tail(hits, i, along, power * tail_fraction, tail_m, echoes, count)
+    return Echoes(echoes.turns[:count], echoes.ranges[:count], echoes.powers[:count], echoes.sources[:count])
+
+
+# The three functions below are inlined, since passing tuples of arrays costs a count of references for each.
+@compiled(inline="always")
+def _footprint(hits, i, ray_spacing):  # pragma: no cover (compiled)
+    """Normal in the plane, coordinate along the surface, and half the width [m] that a ray stands for."""
+    x, y = hits.points[i, 0], hits.points[i, 1]
+    nx, ny = hits.normals[i, 0], hits.normals[i, 1]
+    upright = np.hypot(nx, ny)
+    along, half = x + 0.37 * y, 0.0
+    if upright > 0.3:
+        nx, ny = nx / upright, ny / upright
+        along = -ny * x + nx * y
+        facing = abs(hits.directions[i, 0] * nx + hits.directions[i, 1] * ny)
+        half = min(0.5 * hits.ranges[i] * ray_spacing / max(facing, 0.02), 0.5 * CELL * (MOST_CELLS - 1))
+    return nx, ny, along, half
+
+
+@compiled(inline="always")
+def _scatter_cells(hits, i, footprint, echoes, count):  # pragma: no cover (compiled)
+    """Append the echoes of the cells in a hit's footprint; returns the new count and their total power."""
+    nx, ny, along, half = footprint
+    number, z = int(hits.objects[i]), int(np.floor(hits.points[i, 2]))
+    first = int(np.floor(along / CELL))
+    last, fraction, total = first + 1, 1.0, 0.0
+    is_spread = hits.is_direct[i] and 2.0 * half > CELL
+    if is_spread:
+        first = int(np.ceil((along - half) / CELL - 0.5))
+        last = int(np.ceil((along + half) / CELL - 0.5))
+        fraction = CELL / (2.0 * half)
+    for cell in range(first, last):
+        power = hits.weights[i] * fraction * _answer(hits.surfaces[i], hits.cosines[i], number, cell, z)
+        total += power
+        if power < WEAKEST:
+            continue
+        echoes.powers[count], echoes.sources[count] = power, i
+        echoes.turns[count], echoes.ranges[count] = 0.0, hits.ranges[i]
         if is_spread:
-            first, last = int(np.ceil((s - half) / CELL - 0.5)), int(np.ceil((s + half) / CELL - 0.5))
-            share = CELL / (2.0 * half)
-        for cell in range(first, last):
-            power = weights[i] * share * _answer(surfaces[i], cosines[i], number, cell, z)
-            together += power
-            if power < WEAKEST:
-                continue
-            turns[count], ranges[count], powers[count], sources[count] = 0.0, totals[i], power, i
-            if is_spread:
-                step = (cell + 0.2 + 0.6 * _hash_unit(number, cell, z, 6)) * CELL - s
-                turns[count], ranges[count] = _step_aside(headings[i], totals[i], -step * ny, step * nx)
-            count += 1
-        if together * haze > WEAKEST:
-            n_later = min(MOST_LATER, 1 + int(together * haze / LATER_POWER))
-            for k in range(n_later):
-                turns[count] = 0.06 * (_hash_unit(number, middle, z, 7 + 3 * k) - 0.5)
-                ranges[count] = totals[i] + clutter_tail_m * _hash_exponential(number, middle, z, 8 + 3 * k)
-                later = together * haze / n_later * _hash_exponential(number, middle, z, 9 + 3 * k) ** 3 / 6.0
-                powers[count], sources[count] = later, i
-                count += 1
-    return turns[:count], ranges[:count], powers[:count], sources[:count]
+            step = (cell + 0.2 + 0.6 * _hash_unit(number, cell, z, 6)) * CELL - along
+            turn, length = _step_aside(hits.headings[i], hits.ranges[i], -step * ny, step * nx)
+            echoes.turns[count], echoes.ranges[count] = turn, length
+        count += 1
+    return count, total
+
+
+@compiled(inline="always")
+def _add_clutter_tail(hits, i, along, power, tail_m, echoes, count):  # pragma: no cover (compiled)
+    """Append the echoes that took a longer path, of a given total power; returns the new count."""
+    number, z = int(hits.objects[i]), int(np.floor(hits.points[i, 2]))
+    cell = int(np.floor(along / CELL))
+    n_later = min(MOST_LATER, 1 + int(power / LATER_POWER))
+    for k in range(n_later):
+        echoes.turns[count] = 0.06 * (_hash_unit(number, cell, z, 7 + 3 * k) - 0.5)
+        delay_m = tail_m * _hash_exponential(number, cell, z, 8 + 3 * k)
+        echoes.ranges[count] = hits.ranges[i] + delay_m
+        echoes.powers[count] = power / n_later * _hash_exponential(number, cell, z, 9 + 3 * k) ** 3 / 6.0
+        echoes.sources[count] = i
+        count += 1
+    return count
 
 
 @compiled
@@ -216,9 +270,11 @@ def _answer(surface, cosine, number, cell, z):  # pragma: no cover (compiled)
     """
     aspect = int(np.arccos(min(cosine, 1.0)) / ASPECT)
     diffuse = (
-        surface[0] * max(cosine, 1e-3) ** surface[1]
-        * _hash_exponential(number, cell, z, 3) * _hash_exponential(number, cell + 7919 * aspect, z, 10)
-    )  # fmt: skip
+        surface[0]
+        * max(cosine, 1e-3) ** surface[1]
+        * _hash_exponential(number, cell, z, 3)
+        * _hash_exponential(number, cell + 7919 * aspect, z, 10)
+    )
     specular, corner = 0.0, 0.0
     if surface[2] > 0.0:
         tilt = 0.03 * (_hash_unit(number, cell, z, 1) + _hash_unit(number, cell, z, 2) - 1.0)

@@ -1,6 +1,6 @@
 """What a session's slow logs hold: when scans and sweeps begin, row times, odometry with drift, GPS and INS.
 
-Everything here is drawn from given generators and the true drive; nothing is written.
+Everything here is drawn from given generators and the true trajectory; nothing is written.
 """
 
 from __future__ import annotations
@@ -10,9 +10,9 @@ import pandas as pd
 from scipy.signal import lfilter
 
 from rol.geometry import relative_pose
-from rol_sim.drive.town_loop import Drive
+from rol.oxford import N_AZIMUTHS
+from rol_sim.drive.town_loop import Trajectory
 
-N_ROWS = 400
 SWEEP_US = 50_000
 # Where the town lies in UTM zone 30U; x is east, y is north.
 NORTHING, EASTING, ALTITUDE = 5_736_000.0, 619_890.0, 65.0
@@ -68,12 +68,12 @@ def draw_row_stamps(stamp_us: int, turn_us: int, rng: np.random.Generator) -> np
     row_stamps_us : array, shape (400,), int64
         Times as in the file. The beams themselves turn evenly.
     """
-    row = np.arange(N_ROWS)
+    row = np.arange(N_AZIMUTHS)
     burst = (row + 2) // 16  # the first burst has lost its first two rows
     begin = np.where(burst > 0, 10_000.0 * burst - 240.0, 0.0) * turn_us / 250_000.0
     begin = begin + rng.normal(0.0, 40.0, burst[-1] + 1)[burst] * (burst > 0)
-    gaps = rng.choice([8.0, 115.0, 133.0, 150.0, 255.0], N_ROWS, p=[0.2, 0.15, 0.35, 0.15, 0.15])
-    gaps = gaps + rng.normal(0.0, 4.0, N_ROWS) * (gaps > 10.0)
+    gaps = rng.choice([8.0, 115.0, 133.0, 150.0, 255.0], N_AZIMUTHS, p=[0.2, 0.15, 0.35, 0.15, 0.15])
+    gaps = gaps + rng.normal(0.0, 4.0, N_AZIMUTHS) * (gaps > 10.0)
     within = np.cumsum(gaps)
     first = np.searchsorted(burst, burst)  # row in which each row's burst begins
     return stamp_us + np.rint(begin + within - within[first]).astype(np.int64)
@@ -81,7 +81,7 @@ def draw_row_stamps(stamp_us: int, turn_us: int, rng: np.random.Generator) -> np
 
 def scan_row_times(stamp_us: int, turn_us: int) -> np.ndarray:
     """Give the true times at which the beam looks along each row, shape (400,), evenly spread [us]."""
-    return stamp_us + (np.arange(N_ROWS) + 0.5) * turn_us / N_ROWS
+    return stamp_us + (np.arange(N_AZIMUTHS) + 0.5) * turn_us / N_AZIMUTHS
 
 
 def schedule_sweeps(begin_us: int, end_us: int, rng: np.random.Generator) -> np.ndarray:
@@ -164,13 +164,13 @@ def drift_odometry(
     return steps + noise * (0.1 + 0.9 * moving)[:, None]
 
 
-def draw_gps(drive: Drive, rng: np.random.Generator) -> pd.DataFrame:
-    """Give what a 5 Hz GPS receiver logs on a drive, errors of about a metre that change slowly.
+def draw_gps(trajectory: Trajectory, rng: np.random.Generator) -> pd.DataFrame:
+    """Give what a 5 Hz GPS receiver logs on a trajectory, errors of about a metre that change slowly.
 
     Parameters
     ----------
-    drive : Drive
-        The true drive.
+    trajectory : Trajectory
+        The true trajectory.
     rng : numpy.random.Generator
         Draws the errors.
 
@@ -179,24 +179,30 @@ def draw_gps(drive: Drive, rng: np.random.Generator) -> pd.DataFrame:
     table : pandas.DataFrame
         Columns of Oxford's gps.csv.
     """
-    stamps = np.arange(drive.stamps_us[0], drive.stamps_us[-1], 200_010, dtype=np.int64)
+    stamps = np.arange(trajectory.stamps_us[0], trajectory.stamps_us[-1], 200_010, dtype=np.int64)
     error = _slow_error(len(stamps), 0.985, rng) * (0.7, 0.7, 1.0)
-    east, north, up = (_place(drive, stamps) + error).T
+    east, north, up = (_place(trajectory, stamps) + error).T
     count = len(stamps)
-    return pd.DataFrame({
-        "timestamp": stamps, "num_satellites": rng.integers(6, 10, count), **_geographic(east, north, up),
-        "latitude_sigma": rng.uniform(0.6, 0.9, count), "longitude_sigma": rng.uniform(0.5, 0.8, count),
-        "altitude_sigma": rng.uniform(0.8, 1.1, count), **_projected(east, north, up),
-    })  # fmt: skip
+    return pd.DataFrame(
+        {
+            "timestamp": stamps,
+            "num_satellites": rng.integers(6, 10, count),
+            **_geographic(east, north, up),
+            "latitude_sigma": rng.uniform(0.6, 0.9, count),
+            "longitude_sigma": rng.uniform(0.5, 0.8, count),
+            "altitude_sigma": rng.uniform(0.8, 1.1, count),
+            **_projected(east, north, up),
+        }
+    )
 
 
-def draw_ins(drive: Drive, rng: np.random.Generator) -> pd.DataFrame:
-    """Give what a 50 Hz inertial navigation system logs on a drive.
+def draw_ins(trajectory: Trajectory, rng: np.random.Generator) -> pd.DataFrame:
+    """Give what a 50 Hz inertial navigation system logs on a trajectory.
 
     Parameters
     ----------
-    drive : Drive
-        The true drive.
+    trajectory : Trajectory
+        The true trajectory.
     rng : numpy.random.Generator
         Draws the errors.
 
@@ -205,30 +211,49 @@ def draw_ins(drive: Drive, rng: np.random.Generator) -> pd.DataFrame:
     table : pandas.DataFrame
         Columns of Oxford's ins.csv; the vehicle frame is pitched by 0.05 rad against the level radar.
     """
-    stamps = np.arange(drive.stamps_us[0], drive.stamps_us[-1], 20_000, dtype=np.int64)
+    stamps = np.arange(trajectory.stamps_us[0], trajectory.stamps_us[-1], 20_000, dtype=np.int64)
     count = len(stamps)
     error = _slow_error(count, 0.9995, rng) * (0.5, 0.5, 0.6)
-    east, north, up = (_place(drive, stamps) + error).T
-    velocity = drive.velocity(stamps) + rng.normal(0.0, 0.02, (count, 2))
-    heading = 0.5 * np.pi - drive.pose(stamps)[:, 2] + 0.01 * _slow_error(count, 0.9995, rng)[:, 0]
-    return pd.DataFrame({
-        "timestamp": stamps, "ins_status": "INS_SOLUTION_GOOD",
-        **_geographic(east, north, up), **_projected(east, north, up),
-        "velocity_north": velocity[:, 1], "velocity_east": velocity[:, 0],
-        "velocity_down": rng.normal(0.0, 0.02, count),
-        "roll": rng.normal(0.0, 0.003, count), "pitch": -0.05 + rng.normal(0.0, 0.003, count),
-        "yaw": (heading + np.pi) % (2.0 * np.pi) - np.pi,
-    })[_INS_ORDER]  # fmt: skip
+    east, north, up = (_place(trajectory, stamps) + error).T
+    velocity = trajectory.velocity(stamps) + rng.normal(0.0, 0.02, (count, 2))
+    heading = 0.5 * np.pi - trajectory.pose(stamps)[:, 2] + 0.01 * _slow_error(count, 0.9995, rng)[:, 0]
+    return pd.DataFrame(
+        {
+            "timestamp": stamps,
+            "ins_status": "INS_SOLUTION_GOOD",
+            **_geographic(east, north, up),
+            **_projected(east, north, up),
+            "velocity_north": velocity[:, 1],
+            "velocity_east": velocity[:, 0],
+            "velocity_down": rng.normal(0.0, 0.02, count),
+            "roll": rng.normal(0.0, 0.003, count),
+            "pitch": -0.05 + rng.normal(0.0, 0.003, count),
+            "yaw": (heading + np.pi) % (2.0 * np.pi) - np.pi,
+        }
+    )[_INS_ORDER]
 
 
 _INS_ORDER = [
-    "timestamp", "ins_status", "latitude", "longitude", "altitude", "northing", "easting", "down", "utm_zone",
-    "velocity_north", "velocity_east", "velocity_down", "roll", "pitch", "yaw",
-]  # fmt: skip
+    "timestamp",
+    "ins_status",
+    "latitude",
+    "longitude",
+    "altitude",
+    "northing",
+    "easting",
+    "down",
+    "utm_zone",
+    "velocity_north",
+    "velocity_east",
+    "velocity_down",
+    "roll",
+    "pitch",
+    "yaw",
+]
 
 
-def _place(drive: Drive, stamps_us: np.ndarray) -> np.ndarray:
-    return drive.pose(stamps_us) * (1.0, 1.0, 0.0)
+def _place(trajectory: Trajectory, stamps_us: np.ndarray) -> np.ndarray:
+    return trajectory.pose(stamps_us) * (1.0, 1.0, 0.0)
 
 
 def _slow_error(count: int, memory: float, rng: np.random.Generator) -> np.ndarray:

@@ -16,13 +16,21 @@ import cv2
 import numpy as np
 
 from rol.maps import thin_points
-from rol.oxford import EXTRINSICS, RANGE_UNIT, RadarScan, load_velodyne_raw, velodyne_raw_to_points
+from rol.oxford import (
+    EXTRINSICS,
+    LIDARS,
+    N_AZIMUTHS,
+    RANGE_UNIT,
+    RadarScan,
+    load_velodyne_raw,
+    velodyne_raw_to_points,
+)
 from rol_data import rall
 from rol_sim.drive.recorded_poses import interpolate_trajectory, park_vehicles, plan_encounters
-from rol_sim.drive.town_loop import Drive, build_route, plan_trajectory
+from rol_sim.drive.town_loop import Trajectory, build_route, plan_trajectory
 from rol_sim.drive.traffic import Traffic, plan_traffic
 from rol_sim.sensors.lidar import LidarSettings, Sweep, schedule_firings, simulate_sweep
-from rol_sim.sensors.radar import RadarSettings, simulate_scan
+from rol_sim.sensors.radar import COUNT_STEP, FIRST_COUNT, RadarSettings, simulate_scan
 from rol_sim.session import logs
 from rol_sim.session.settings import SessionSettings, SettingsError, SimulationSettings, describe
 from rol_sim.world import mapped
@@ -31,18 +39,16 @@ from rol_sim.world.mesh import Mesh, merge_meshes
 from rol_sim.world.scene import Scene
 from rol_sim.world.town import Town, add_session_objects, build_town
 
-LIDARS = ("velodyne_left", "velodyne_right")
-FIRST_COUNT, COUNT_STEP = 13, 14  # encoder counts of the radar's rows: 13, 27, ... 5599 of 5600
-WORLD_RADIUS_M = 180.0  # how far from the drive a world grown from a map reaches
+WORLD_RADIUS_M = 180.0  # how far from the trajectory a world grown from a map reaches
 CAR_M = 1.8  # so near to where the car drives stands nothing, whatever the map says
 CLEAR_M = 3.0  # what the map does not show stays so far from there
 # Parts of a session that draw from generators of their own.
-OBJECTS, DRIVE, TRAFFIC, SCANS, SWEEPS, ODOMETRY, GPS, INS, SCAN, SWEEP = range(10)
+OBJECTS, TRAJECTORY, TRAFFIC, SCANS, SWEEPS, ODOMETRY, GPS, INS, SCAN, SWEEP = range(10)
 
 
 @dataclass(frozen=True)
 class SimulatedSession:
-    """A session before it is written: the town as it finds it, its drive, its traffic and its times.
+    """A session before it is written: the town as it finds it, its trajectory, its traffic and its times.
 
     Attributes
     ----------
@@ -56,7 +62,7 @@ class SimulatedSession:
         Gives the height of the land at places, shape (n, 2) -> (n,) [m].
     scene : Scene
         The world as this session finds it, without what moves.
-    drive : Drive
+    trajectory : Trajectory
         Where the radar is at any time.
     traffic : Traffic
         Who else is on the move.
@@ -73,7 +79,7 @@ class SimulatedSession:
     town: Town | None
     ground: Callable[[np.ndarray], np.ndarray]
     scene: Scene
-    drive: Drive
+    trajectory: Trajectory
     traffic: Traffic
     scans_us: np.ndarray
     turns_us: np.ndarray
@@ -91,7 +97,7 @@ class SimulatedSession:
 
     def scene_at(self, stamp_us: float, radius: float = 170.0) -> Scene:
         """Give the town with everything that moves within a radius [m] where it is at one time [us]."""
-        middle = self.drive.pose(np.array([stamp_us]))[0]
+        middle = self.trajectory.pose(np.array([stamp_us]))[0]
         return self.scene.with_moving(
             self.traffic.meshes_at(self.ground, stamp_us, self.first_mover, middle, radius)
         )
@@ -102,7 +108,7 @@ def _generator(settings: SimulationSettings, name: str, part: int, index: int = 
 
 
 def build_session(settings: SimulationSettings, name: str) -> SimulatedSession:
-    """Build the town as one session finds it, and plan its drive.
+    """Build the town as one session finds it, and plan its trajectory.
 
     Parameters
     ----------
@@ -127,16 +133,16 @@ def build_session(settings: SimulationSettings, name: str) -> SimulatedSession:
     n_scans = own.scans if given is None else len(given)
     scans, turns = logs.schedule_scans(own.first_stamp_us, n_scans, rng(SCANS))
     if given is None:
-        town, ground, mesh, drive, traffic = _find_town(settings, own, scans, turns, rng)
+        town, ground, mesh, trajectory, traffic = _find_town(settings, own, scans, turns, rng)
     else:
         town, ground = None, _flat
-        mesh, drive, traffic = _find_route(settings, own, given, scans + turns // 2, rng)
+        mesh, trajectory, traffic = _find_route(settings, own, given, scans + turns // 2, rng)
     span = int(scans[0]) - 100_000, int(scans[-1] + turns[-1]) + 100_000
     sweeps = {sensor: logs.schedule_sweeps(*span, rng(SWEEPS, k)) for k, sensor in enumerate(LIDARS)}
     kind = own.sweeps or settings.sweeps
     chosen = {sensor: logs.choose_sweeps(us, scans, turns, kind) for sensor, us in sweeps.items()}
     return SimulatedSession(
-        settings, name, town, ground, Scene(mesh), drive, traffic, scans, turns, sweeps, chosen
+        settings, name, town, ground, Scene(mesh), trajectory, traffic, scans, turns, sweeps, chosen
     )
 
 
@@ -177,23 +183,32 @@ def load_route(settings: SimulationSettings, own: SessionSettings) -> np.ndarray
 
 def _find_town(
     settings: SimulationSettings, own: SessionSettings, scans: np.ndarray, turns: np.ndarray, rng: Callable
-) -> tuple[Town, Callable[[np.ndarray], np.ndarray], Mesh, Drive, Traffic]:
+) -> tuple[Town, Callable[[np.ndarray], np.ndarray], Mesh, Trajectory, Traffic]:
     """The town as one session finds it, and who is on the move."""
     town = _build_town(settings.seed, settings.loop_m, settings.relief_m)
     standing = add_session_objects(
-        town, rng(OBJECTS), parked_share=own.parked_share, leaf_density=own.leaf_density,
+        town,
+        rng(OBJECTS),
+        parked_share=own.parked_share,
+        leaf_density=own.leaf_density,
         changed_share=own.changed_share,
-    )  # fmt: skip
+    )
     route = build_route(town.plan)
     duration_s = float(scans[-1] + turns[-1] - scans[0]) * 1e-6
-    drive = plan_trajectory(
-        route, int(scans[0]), duration_s, rng(DRIVE),
-        start_m=settings.start_m, cruise_mps=own.cruise_mps, n_stops=own.stops, stand_s=own.stand_s,
-    )  # fmt: skip
-    traffic = plan_traffic(
-        town.plan, route, drive, rng(TRAFFIC), n_vehicles=own.vehicles, n_people=own.people
+    trajectory = plan_trajectory(
+        route,
+        int(scans[0]),
+        duration_s,
+        rng(TRAJECTORY),
+        start_m=settings.start_m,
+        cruise_mps=own.cruise_mps,
+        n_stops=own.stops,
+        stand_s=own.stand_s,
     )
-    return town, town.plan.ground, merge_meshes([town.mesh, standing]), drive, traffic
+    traffic = plan_traffic(
+        town.plan, route, trajectory, rng(TRAFFIC), n_vehicles=own.vehicles, n_people=own.people
+    )
+    return town, town.plan.ground, merge_meshes([town.mesh, standing]), trajectory, traffic
 
 
 def _find_route(
@@ -202,7 +217,7 @@ def _find_route(
     poses: np.ndarray,
     middles_us: np.ndarray,
     rng: Callable,
-) -> tuple[Mesh, Drive, Traffic]:
+) -> tuple[Mesh, Trajectory, Traffic]:
     """The world of the map as one session finds it, and who is on the move."""
     places = thin_points(poses[:, :2], 2.0)[0]
     path = str(rall.find_real_root(settings.real_root) / rall.MAP_PATH)
@@ -214,17 +229,22 @@ def _find_route(
         mapped.crop_cells(later, lane, WORLD_RADIUS_M, clear_m=CAR_M),  # the map keeps traces of traffic
         mapped.crop_cells(unmapped, lane, WORLD_RADIUS_M, clear_m=CLEAR_M),
     )
-    drive = interpolate_trajectory(middles_us, poses)
+    trajectory = interpolate_trajectory(middles_us, poses)
     things = [
         mapped.build_ground(places, WORLD_RADIUS_M),
         mapped.build_pieces(left, settings.seed, leaf_density=own.leaf_density),
     ]
     parked = park_vehicles(
-        drive, cells.points, rng(DRIVE), parked_share=own.parked_share,
+        trajectory,
+        cells.points,
+        rng(TRAJECTORY),
+        parked_share=own.parked_share,
         first_object=int(left.groups.max(initial=0)) + 1,
-    )  # fmt: skip
-    traffic = plan_encounters(drive, rng(TRAFFIC), vehicles_per_min=own.vehicles, people_per_min=own.people)
-    return merge_meshes([*things, parked]), drive, traffic
+    )
+    traffic = plan_encounters(
+        trajectory, rng(TRAFFIC), vehicles_per_min=own.vehicles, people_per_min=own.people
+    )
+    return merge_meshes([*things, parked]), trajectory, traffic
 
 
 def build_twins(real_root: Path | str, seed: int = 1, margin_s: float = 30.0) -> SimulatedSession:
@@ -265,20 +285,23 @@ def build_twins(real_root: Path | str, seed: int = 1, margin_s: float = 30.0) ->
     middles = stamps + turns // 2
     mean_mps = np.hypot(*(poses[-1] - poses[0])[:2]) / ((middles[-1] - middles[0]) * 1e-6)
     ends = [
-        np.column_stack([
-            pose[0] + mean_mps * seconds * np.cos(pose[2]), pose[1] + mean_mps * seconds * np.sin(pose[2]),
-            np.full(len(seconds), pose[2]),
-        ])
+        np.column_stack(
+            [
+                pose[0] + mean_mps * seconds * np.cos(pose[2]),
+                pose[1] + mean_mps * seconds * np.sin(pose[2]),
+                np.full(len(seconds), pose[2]),
+            ]
+        )
         for pose, seconds in ((poses[0], before), (poses[-1], after))
-    ]  # fmt: skip
+    ]
     way = np.concatenate([ends[0], poses, ends[1]])
     times = np.concatenate(
         [middles[0] + (before * 1e6).astype(np.int64), middles, middles[-1] + (after * 1e6).astype(np.int64)]
     )
-    mesh, drive, traffic = _find_route(settings, own, way, times, rng)
+    mesh, trajectory, traffic = _find_route(settings, own, way, times, rng)
     none: dict[str, np.ndarray] = {sensor: np.zeros(0, dtype=np.int64) for sensor in LIDARS}
     return SimulatedSession(
-        settings, name, None, _flat, Scene(mesh), drive, traffic, stamps, turns, none, none
+        settings, name, None, _flat, Scene(mesh), trajectory, traffic, stamps, turns, none, none
     )
 
 
@@ -320,24 +343,24 @@ def make_scan(session: SimulatedSession, index: int) -> RadarScan:
         session.generator(SCAN, index),
     )
     _, settings = sensor_settings(session.settings)
-    height = settings.height + float(session.ground(session.drive.pose(np.array([stamp]))[:, :2])[0])
+    height = settings.height + float(session.ground(session.trajectory.pose(np.array([stamp]))[:, :2])[0])
     times = logs.scan_row_times(stamp, turn)
     middle = stamp + 0.5 * turn
     bodies, _, velocities = session.traffic.bodies_at(
-        middle, session.drive.pose(np.array([middle]))[0], 170.0
+        middle, session.trajectory.pose(np.array([middle]))[0], 170.0
     )
     moves = {session.first_mover + int(i): tuple(v) for i, v in zip(bodies, velocities, strict=True)}
     codes = simulate_scan(
         session.scene_at(middle),
-        session.drive.pose(times),
-        session.drive.velocity(times),
+        session.trajectory.pose(times),
+        session.trajectory.velocity(times),
         rng,
         replace(settings, height=height),
         moves,
     )
-    counters = (FIRST_COUNT + COUNT_STEP * np.arange(logs.N_ROWS)).astype(np.uint16)
+    counters = (FIRST_COUNT + COUNT_STEP * np.arange(N_AZIMUTHS)).astype(np.uint16)
     return RadarScan(
-        logs.draw_row_stamps(stamp, turn, rng), counters, np.full(logs.N_ROWS, 255, np.uint8), codes
+        logs.draw_row_stamps(stamp, turn, rng), counters, np.full(N_AZIMUTHS, 255, np.uint8), codes
     )
 
 
@@ -362,7 +385,7 @@ def make_sweep(session: SimulatedSession, sensor: str, index: int) -> Sweep:
     stamps, angles = schedule_firings(
         int(session.sweeps_us[sensor][index]), rng, first_angle=float(rng.uniform(0.0, 0.006))
     )
-    poses = session.drive.pose(stamps)
+    poses = session.trajectory.pose(stamps)
     height = session.settings.radar_height_m + session.ground(poses[:1, :2])[0]
     T_radar_lidar = np.linalg.inv(EXTRINSICS["radar"]) @ EXTRINSICS[sensor]
     settings, _ = sensor_settings(session.settings)

@@ -23,7 +23,7 @@ import numpy as np
 
 from rol.evaluation import write_tum
 from rol.files import is_used, read_marker, write_bytes, write_text
-from rol.oxford import RadarOdometry, VelodyneRaw
+from rol.oxford import LIDARS, RadarOdometry, VelodyneRaw
 from rol_sim.session import logs, oxford_files
 from rol_sim.session.settings import SimulationSettings, describe
 from rol_sim.session.simulation import (
@@ -39,7 +39,6 @@ from rol_sim.session.simulation import (
 
 SCAN_BYTES, SWEEP_BYTES = 470_000, 65_000  # what a file takes on the mean
 FORMAT = 4  # raise it when the same settings give other files
-LIDARS = ("velodyne_left", "velodyne_right")
 _MADE = (
     "session.json",
     "truth.tum",
@@ -251,7 +250,7 @@ def _write_logs(folder: Path, session: SimulatedSession) -> None:
         ):  # a session without sweeps looks like one whose lidars were not fetched
             chosen = session.sweeps_us[sensor][session.chosen[sensor]]
             oxford_files.save_timestamps(folder / f"{sensor}.timestamps", chosen)
-    truth = session.drive.pose(middles)
+    truth = session.trajectory.pose(middles)
     steps = np.zeros((len(scans) - 2, 6))  # as in the data set, the last scan has no pose
     steps[:, [0, 1, 5]] = logs.drift_odometry(
         truth[:-1],
@@ -263,17 +262,22 @@ def _write_logs(folder: Path, session: SimulatedSession) -> None:
         folder / "gt" / "radar_odometry.csv",
         RadarOdometry(middles[1:-1], middles[:-2], scans[1:-1], scans[:-2], steps),
     )
-    oxford_files.save_gps(folder / "gps" / "gps.csv", logs.draw_gps(session.drive, session.generator(GPS)))
-    oxford_files.save_ins(folder / "gps" / "ins.csv", logs.draw_ins(session.drive, session.generator(INS)))
+    oxford_files.save_gps(
+        folder / "gps" / "gps.csv", logs.draw_gps(session.trajectory, session.generator(GPS))
+    )
+    oxford_files.save_ins(
+        folder / "gps" / "ins.csv", logs.draw_ins(session.trajectory, session.generator(INS))
+    )
     write_tum(folder / "truth.tum", scans, truth)
     _write_json(folder / "session.json", _summarise(session, truth))
 
 
 def _summarise(session: SimulatedSession, truth: np.ndarray) -> dict[str, Any]:
     way = np.interp(
-        [session.scans_us[0], session.scans_us[-1] + session.turns_us[-1]], session.drive.stamps_us,
-        np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(session.drive.poses[:, :2], axis=0).T))]),
-    )  # fmt: skip
+        [session.scans_us[0], session.scans_us[-1] + session.turns_us[-1]],
+        session.trajectory.stamps_us,
+        np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(session.trajectory.poses[:, :2], axis=0).T))]),
+    )
     duration = float(session.scans_us[-1] + session.turns_us[-1] - session.scans_us[0]) * 1e-6
     return {
         "name": session.name,

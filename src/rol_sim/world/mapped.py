@@ -265,9 +265,7 @@ def draw_unmapped(cells: Cells, rng: np.random.Generator, *, share: float = 0.1)
 
 def join_cells(first: Cells, second: Cells) -> Cells:
     """Put two sets of cells into one; their group numbers are kept."""
-    return Cells(*(
-        np.concatenate([getattr(first, f.name), getattr(second, f.name)]) for f in fields(Cells)
-    ))  # fmt: skip
+    return Cells(*(np.concatenate([getattr(first, f.name), getattr(second, f.name)]) for f in fields(Cells)))
 
 
 def build_pieces(cells: Cells, seed: int, *, leaf_density: float = 1.0) -> Mesh:
@@ -289,9 +287,12 @@ def build_pieces(cells: Cells, seed: int, *, leaf_density: float = 1.0) -> Mesh:
         VEHICLE faces; the object number is that of the group.
     """
     builders = {
-        Kind.FACADE: _build_rows, Kind.WALL: _build_rows, Kind.PLANT: _build_plants, Kind.POLE: _build_poles,
+        Kind.FACADE: _build_rows,
+        Kind.WALL: _build_rows,
+        Kind.PLANT: _build_plants,
+        Kind.POLE: _build_poles,
         Kind.VEHICLE: _build_vehicle_sides,
-    }  # fmt: skip
+    }
     meshes = []
     for kind, build in builders.items():
         own = cells.take(np.flatnonzero(cells.kinds == kind))
@@ -376,10 +377,15 @@ def _build_strips(
     step = np.broadcast_to(half, n)[:, None] * np.column_stack([np.cos(headings), np.sin(headings)])
     low, high = np.broadcast_to(low, n), np.broadcast_to(high, n)
     left, right = points - step, points + step
-    corners = np.stack([
-        np.column_stack([left, low]), np.column_stack([right, low]),
-        np.column_stack([right, high]), np.column_stack([left, high]),
-    ], axis=1)  # fmt: skip
+    corners = np.stack(
+        [
+            np.column_stack([left, low]),
+            np.column_stack([right, low]),
+            np.column_stack([right, high]),
+            np.column_stack([left, high]),
+        ],
+        axis=1,
+    )
     first = 4 * np.arange(n)[:, None]
     triangles = np.stack([first + (0, 1, 2), first + (0, 2, 3)], axis=1)
     return make_mesh(corners.reshape(-1, 3), triangles.reshape(-1, 3), material, np.repeat(groups, 2))
@@ -391,7 +397,7 @@ def build_ground(places: np.ndarray, radius: float, object_id: int = -2) -> Mesh
     Parameters
     ----------
     places : array, shape (m, 2)
-        Places, such as the poses of a drive [m].
+        Places, such as the poses of a trajectory [m].
     radius : float
         How far the ground reaches [m].
     object_id : int

@@ -198,10 +198,13 @@ def _mark_parking(plan: StreetPlan, street: Street, side: int, rng: np.random.Ge
 def _furnish(plan: StreetPlan, street: Street, rng: np.random.Generator) -> list[tuple[str, np.ndarray]]:
     pieces, length = [], float(street.arc[-1])
     for kind, spacing, back in (
-        ("lamp", 27.0, 0.45), ("sign", 38.0, 0.5), ("bin", 70.0, 1.6), ("cabinet", 110.0, 1.7),
+        ("lamp", 27.0, 0.45),
+        ("sign", 38.0, 0.5),
+        ("bin", 70.0, 1.6),
+        ("cabinet", 110.0, 1.7),
         ("post_box", 190.0, 0.6),
         ("shelter", 210.0, 1.2),
-    ):  # fmt: skip
+    ):
         s = float(rng.uniform(0.2, 1.0)) * spacing
         while s < length - 7.0:
             side = 1 if rng.random() < 0.5 else -1
