@@ -389,6 +389,22 @@ def test_rule_of_the_page_bites(tmp_path: Path, tab: Tab, gone: str, words: str)
     assert any(rule == "page" and words in what for rule, what in faults), faults
 
 
+@pytest.mark.parametrize("views", [(WIDE, NARROW), (NARROW, WIDE)])
+def test_fault_of_one_view_is_found_there(tmp_path: Path, tab: Tab, views: tuple[View, View]) -> None:
+    article = "<style>@media (prefers-color-scheme: dark) { h1 { color: #ccc } }</style><p style='width: 700px'>wide</p>"
+    visits = tab.visit(small_page(tmp_path, article), views)
+    assert {view: {rule for rule, _ in visit.faults} for view, visit in zip(views, visits, strict=True)} == {
+        WIDE: set(),
+        NARROW: {"contrast", "width"},
+    }
+
+
+def test_colours_that_were_checked_are_not_checked_again(tmp_path: Path, tab: Tab) -> None:
+    known: set[str] = set()
+    page = small_page(tmp_path, "<p style='color: #999'>pale</p>")
+    assert [len(tab.visit(page, [WIDE], known)[0].faults) for _ in range(2)] == [1, 0]
+
+
 def test_every_rule_is_seen_to_bite() -> None:
     assert {rule for rule, _, _ in BAD} == set(RULES)
 
