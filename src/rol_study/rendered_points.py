@@ -37,7 +37,7 @@ def render_points(
     headings: int | None = None,
     **changes: Any,
 ) -> Iterator[np.ndarray]:
-    """Give the fake lidar points of a stretch of a real session, scan by scan, as its radar might have led to them.
+    """Generate the lidar points of a segment of a real session, scan by scan, as its radar might have led to them.
 
     Real are the map and the poses, and with them the speed and the stops. Simulated are the radar, the heights and materials
     of the world, what the map does not show or shows no more, and who is met.
@@ -49,7 +49,7 @@ def render_points(
     number : str
         Of the session, such as "02".
     first_scan, n_scans : int
-        Where in ``pose_xy_<number>.txt`` the stretch begins, and how many scans it has: at least 3, or 0 for all that follow.
+        Where in ``pose_xy_<number>.txt`` the segment begins, and how many scans it has: at least 3, or 0 for all that follow.
     network : TrainedNetwork
         From `rol.pix2pix.load_network`; threshold and thinning are its own.
     seed : int
@@ -76,10 +76,10 @@ def render_points(
     -----
     The public poses have no times: scans are taken to be a quarter of a second apart, give or take the radar's own 1.5 ms.
     The car moves while its radar turns. This is taken out as in the live chain, but by a velocity from the true poses, at
-    the ends of the stretch from one side only; errors of an odometry do not enter.
+    the ends of the segment from one side only; errors of an odometry do not enter.
 
-    In memory are the map, one scan, and the world within 180 m of the stretch. What has changed since the map was made is
-    drawn for a stretch: another ``first_scan`` or ``n_scans`` is another day.
+    In memory are the map, one scan, and the world within 180 m of the segment. What has changed since the map was made is
+    drawn for a segment: another ``first_scan`` or ``n_scans`` is another day.
 
     The network `unet` was trained on this route, in such a world of seed 21: from scans 0 to 4999 of session 02 but for the
     surroundings of the eleven real scans and of one more place (``sets`` in its card). Clouds from there flatter it.
@@ -91,7 +91,7 @@ def render_points(
 def build_segment(
     real_root: Path | str, number: str, first_scan: int, n_scans: int, seed: int, **changes: Any
 ) -> SimulatedSession:
-    """Prepare the trajectory along a stretch of a real session, see `render_points`.
+    """Prepare the trajectory along a segment of a real session, see `render_points`.
 
     Returns
     -------
@@ -120,7 +120,7 @@ def _translate(session: SimulatedSession, network: TrainedNetwork, **how: Any) -
 
 
 def true_twists(session: SimulatedSession) -> np.ndarray:
-    """Give the body velocity at every scan from the true poses, as `rol.pairs.estimate_twists` does from an odometry.
+    """Compute the body velocity at every scan from the true poses, as `rol.pairs.estimate_twists` does from an odometry.
 
     Parameters
     ----------
