@@ -44,10 +44,10 @@ from translator import ROOT, describe_machine
 
 from rol.bev import image_to_points
 from rol.evaluation import KITTI_LENGTHS_M, drift_by_length, pose_errors, read_tum, rmse
-from rol.fakes import list_fakes, read_image
 from rol.files import write_text
 from rol.geometry import accumulate_increments, compose, relative_pose, transform_points
 from rol.odometry import fit_rigid, icp_2d, scan_to_scan_icp
+from rol.pairs import generated_folder, read_image
 from rol.radar import MEASURED, SDK
 from rol_beyond.local_map_odometry import deskew_cloud, local_map_odometry
 from rol_beyond.scan_matching import correlative_scan_match
@@ -176,23 +176,26 @@ def list_ways() -> dict[str, Way]:
     return ways
 
 
-def load_session(fakes: Path, session: Path) -> tuple[Clouds, np.ndarray, np.ndarray]:
-    """Clouds of the fake images, their stamps [us], and the true poses at mid-scan."""
-    listed_us, how = list_fakes(fakes)
+def load_session(generated: Path, session: Path) -> tuple[Clouds, np.ndarray, np.ndarray]:
+    """Clouds of the generated images, their stamps [us], and the true poses at mid-scan."""
+    images = generated_folder(generated)
+    about = images.read()
     if not (session / "truth.tum").is_file():
         raise ValueError(f"{session / 'truth.tum'}: missing; `make book` makes the session")
     stamps_us, truth = read_tum(session / "truth.tum")
-    is_listed = np.isin(stamps_us, listed_us)
+    is_listed = np.isin(stamps_us, about["stamps_us"])
     stamps_us = stamps_us[is_listed]
-    clouds = [image_to_points(read_image(fakes / f"{us}.png"), **how) for us in stamps_us.tolist()]
+    clouds = [image_to_points(read_image(images.path(us)), **about["points"]) for us in stamps_us.tolist()]
     return clouds, stamps_us, truth[is_listed]
 
 
 def find_sessions(results: Path, sessions: Path) -> dict[str, tuple[Clouds, np.ndarray, np.ndarray]]:
-    """Load every localization session that has fakes."""
+    """Load every localization session that has generated images."""
     folders = sorted(path.parent for path in (results / "fake").glob("sim-*-seq*/fake.json"))
     if not folders:
-        raise ValueError(f"{results / 'fake'}: no fakes of sessions sim-*-seq*; `make book` makes them")
+        raise ValueError(
+            f"{results / 'fake'}: no generated images of sessions sim-*-seq*; `make book` makes them"
+        )
     return {folder.name: load_session(folder, sessions / folder.name) for folder in folders}
 
 

@@ -26,6 +26,7 @@ import scipy
 import torch
 from scipy.ndimage import map_coordinates
 
+import rol_beyond.unet  # noqa: F401 (registers the architecture)
 from rol.bev import image_to_points
 from rol.files import write_text
 from rol.pix2pix import TrainConfig, build_generator, generate, has_bf16, load_weights, train_step

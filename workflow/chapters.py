@@ -305,18 +305,16 @@ def imported_names(source: str, package: tuple[str, ...] = ()) -> frozenset[tupl
 
 
 def files_of_import(name: tuple[str, ...]) -> list[Path]:
-    """List the files that an import runs: each package on its path, then the module; none if a part is missing."""
+    """List the files that an import runs, packages first; none if the module or the name in it is missing."""
     files: list[Path] = []
-    for n, part in enumerate(name, start=1):
-        place = SOURCE.joinpath(*name[:n])
-        if (place / "__init__.py").is_file():
-            files.append(place / "__init__.py")
-        elif place.with_suffix(".py").is_file():
-            return [*files, place.with_suffix(".py")]  # what follows is a name in the module
-        else:
-            is_last = files and n == len(name)
-            is_name = is_last and part in ("*", *re.findall(r"\w+", code_text(read_text(files[-1]))))
-            return files if is_name else []
+    place = SOURCE
+    for n, part in enumerate(name):
+        place = place / part
+        found = [file for file in (place / "__init__.py", place.with_suffix(".py")) if file.is_file()]
+        if not found:  # `part` is a name in the last file, or missing
+            known = ["*", *re.findall(r"\w+", code_text(read_text(files[-1])))] if files else []
+            return files if n == len(name) - 1 and part in known else []
+        files.append(found[0])
     return files
 
 

@@ -13,7 +13,7 @@ import sys
 import torch
 
 import rol_beyond.unet  # noqa: F401 (registers the architecture)
-from rol.fakes import translate_session
+from rol_beyond.generated import generate_session
 from rol_book.parameters import positive
 
 BF16 = {"auto": "auto", "true": True, "false": False}
@@ -44,7 +44,7 @@ def main(words: list[str] | None = None) -> int:
     torch.set_num_threads(given.threads)
     options = {"threshold": given.threshold, "device": given.device, "bf16": BF16[given.bf16]}
     try:
-        n_images = sum(1 for _ in translate_session(given.weights, given.pairs, given.out, **options))
+        n_images = sum(1 for _ in generate_session(given.weights, given.pairs, given.out, **options))
     except (ValueError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 1

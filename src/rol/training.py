@@ -250,34 +250,26 @@ def train(
     -----
     Yin et al. 2020, Sec. III-A and IV-A.
     """
-    _check_run(pairs, config)
-    checkpoint = Path(out_dir) / "checkpoint" / "last.safetensors"
-    settings = asdict(config) | dict(hooks.settings)
-    about = {"config": settings, "seed": seed, "pairs": len(pairs), "data": _checksum(pairs)}
-    n_steps = config.n_steps(len(pairs))
-    state = TrainingState(config, seed, options.device, hooks)
-    generator = state.networks["generator"]
-    pix2pix.check_size(pairs[0][0].shape[-2:], None, "first pair", generator.size_step)
-    generator.image_size = tuple(map(int, pairs[0][0].shape[-2:]))
+    state, about = _start(pairs, config, seed, options.device, hooks)
+    checkpoint, n_steps = Path(out_dir) / "checkpoint" / "last.safetensors", config.n_steps(len(pairs))
     if options.resume and checkpoint.is_file():
         state.load(checkpoint, about)
+    generator = state.networks["generator"]
     saved_s = monotonic()
-    while state.step < n_steps or state.sums:  # sums: stopped before the last row was ended
-        generator.train()
-        try:
-            for _ in _train_row(state, pairs, config, seed, hooks, options.num_workers):
-                if monotonic() - saved_s >= 60.0 * options.checkpoint_minutes:
-                    state.save(checkpoint, about)
-                    saved_s = monotonic()
-        except TrainingError as error:
-            kept = f"{checkpoint} stays as it is" if checkpoint.is_file() else "there is no checkpoint yet"
-            raise TrainingError(f"{error}; {kept}") from error
-        _end_row(state, config, len(pairs), held_out)
-        if hooks.on_report is not None:
-            hooks.on_report(state.history[-1], generator)
-        if state.step % config.checkpoint_every == 0 or state.step == n_steps:
-            state.save(checkpoint, about)
-            saved_s = monotonic()
+    try:
+        for _ in _train_steps(state, pairs, config, seed, hooks, options.num_workers):
+            is_last = state.step == n_steps
+            if is_last or state.step % config.report_every == 0:
+                _end_row(state, config, len(pairs), held_out)
+                if hooks.on_report is not None:
+                    hooks.on_report(state.history[-1], generator)
+            is_due = is_last or state.step % config.checkpoint_every == 0
+            if is_due or monotonic() - saved_s >= 60.0 * options.checkpoint_minutes:
+                state.save(checkpoint, about)
+                saved_s = monotonic()
+    except TrainingError as error:
+        kept = f"{checkpoint} stays as it is" if checkpoint.is_file() else "there is no checkpoint yet"
+        raise TrainingError(f"{error}; {kept}") from error
     history = pd.DataFrame(state.history, columns=HISTORY_COLUMNS)
     write_text(Path(out_dir) / "history.csv", history.to_csv(index=False))
     header = {**options.metadata, **about, "step": state.step}
@@ -296,34 +288,33 @@ def _end_row(state: TrainingState, config: pix2pix.TrainConfig, n_pairs: int, he
     state.sums = {}
 
 
-def _train_row(
+def _train_steps(
     state: TrainingState, pairs: Any, config: pix2pix.TrainConfig, seed: int, hooks: TrainHooks, workers: int
 ) -> Iterator[int]:
-    """Take the remaining steps of the current row of the history; yield the number taken so far after each."""
-    n_steps = config.n_steps(len(pairs))
-    device = next(state.networks["generator"].parameters()).device
+    """Take the remaining steps; yield the number taken so far after each."""
+    n_steps, device = config.n_steps(len(pairs)), next(state.networks["generator"].parameters()).device
     how = {"lambda_l1": config.lambda_l1, "pixel_loss": hooks.pixel_loss, "bf16": config.bf16}
-    steps = range(state.step, min((len(state.history) + 1) * config.report_every, n_steps))
-    index = {step: batch_indices(step, len(pairs), config.batch_size, seed) for step in steps}
 
-    def load(step: int) -> tuple[Tensor, Tensor]:
-        rng, batch = np.random.default_rng([seed, step, 1]), index[step]
-        drawn = hooks.draw_batch(pairs, batch, rng) if hooks.draw_batch else [pairs[int(i)] for i in batch]
+    def load(step: int) -> tuple[Tensor, Tensor, np.ndarray]:
+        index = batch_indices(step, len(pairs), config.batch_size, seed)
+        rng = np.random.default_rng([seed, step, 1])
+        drawn = hooks.draw_batch(pairs, index, rng) if hooks.draw_batch else [pairs[int(i)] for i in index]
         radar, lidar = (torch.from_numpy(np.stack(side)) for side in zip(*drawn, strict=True))
-        return radar, lidar
+        return radar, lidar, index
 
-    for step, (radar, lidar) in zip(steps, _prefetch(load, steps, workers), strict=True):
+    for radar, lidar, index in _prefetch(load, range(state.step, n_steps), workers):
+        state.networks["generator"].train()
         for optimizer in state.optimizers.values():
-            optimizer.param_groups[0]["lr"] = learning_rate(step, n_steps, config.learning_rate)
+            optimizer.param_groups[0]["lr"] = learning_rate(state.step, n_steps, config.learning_rate)
         batch = radar.to(device), lidar.to(device)
         try:
             losses = pix2pix.train_step(state.networks, state.optimizers, *batch, **how)
         except pix2pix.Pix2PixError as error:
             name = pairs.name if hasattr(pairs, "name") else "pair {}".format
-            names = ", ".join(name(int(i)) for i in index[step])
-            raise TrainingError(f"step {step + 1} of {n_steps}, batch of {names}: {error}") from error
+            names = ", ".join(name(int(i)) for i in index)
+            raise TrainingError(f"step {state.step + 1} of {n_steps}, batch of {names}: {error}") from error
         state.sums = {name: state.sums.get(name, 0.0) + loss for name, loss in losses.items()}
-        state.step = step + 1
+        state.step += 1
         yield state.step
 
 
@@ -338,13 +329,20 @@ def _prefetch(load: Callable[[int], Any], steps: range, workers: int) -> Iterato
             yield batch
 
 
-def _check_run(pairs: Any, config: pix2pix.TrainConfig) -> None:
-    """Refuse an empty data set, and intervals that do not match."""
+def _start(
+    pairs: Any, config: pix2pix.TrainConfig, seed: int, device: str, hooks: TrainHooks
+) -> tuple[TrainingState, dict[str, Any]]:
+    """Build the networks of a run and describe it; refuse an empty data set and intervals that do not match."""
     if len(pairs) == 0:
         raise TrainingError("no pairs to train on")
     rows, saved = config.report_every, config.checkpoint_every
     if saved % rows:
         raise TrainingError(f"checkpoint_every ({saved}) is no multiple of report_every ({rows})")
+    state, size = TrainingState(config, seed, device, hooks), pairs[0][0].shape[-2:]
+    pix2pix.check_size(size, None, "first pair", state.networks["generator"].size_step)
+    state.networks["generator"].image_size = tuple(map(int, size))
+    settings = asdict(config) | dict(hooks.settings)
+    return state, {"config": settings, "seed": seed, "pairs": len(pairs), "data": _checksum(pairs)}
 
 
 def _checksum(pairs: Any) -> int:

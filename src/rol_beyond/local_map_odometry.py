@@ -12,7 +12,6 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from rol import radar
 from rol.compiled import compiled
 from rol.geometry import (
     check_fields,
@@ -34,6 +33,7 @@ from rol.odometry import (
     pair_points,
     sort_cloud,
 )
+from rol.radar import ScanMotion, compensate_points
 from rol_beyond.scan_matching import correlative_scan_match
 
 _FIRST_WINDOW = (6.0, 0.8, np.deg2rad(4.0))  # search window for the first motion [m, m, rad]
@@ -224,41 +224,22 @@ class LocalMapIncrement:
     fault: str
 
 
-def deskew_cloud(
-    points: np.ndarray,
-    twist: np.ndarray | tuple[float, float, float],
-    *,
-    scan_seconds: float | None = None,
-    doppler_seconds: float | None = None,
-) -> np.ndarray:
-    """Compensate the points of one scan for motion and the Doppler effect (deskewing).
+def deskew_cloud(points: np.ndarray, twist: np.ndarray | tuple[float, float, float]) -> np.ndarray:
+    """Compensate the points of one scan for motion and the Doppler effect, see `rol.radar.compensate_points`.
 
     Parameters
     ----------
     points : array, shape (n, 2)
-        Points as read off a scan, each in the radar frame at its own time; the time follows from the bearing, as the beam
-        starts straight ahead and turns clockwise [m].
+        Points as read off a scan, each in the radar frame at its own time [m].
     twist : array-like, shape (3,)
         Body velocity (vx, vy, yaw rate) [m/s, m/s, rad/s].
-    scan_seconds, doppler_seconds : float, optional
-        Time of a turn, and range error per closing speed [s]; those of `rol.radar` if not given.
 
     Returns
     -------
     points : array, shape (n, 2)
         Points in the radar frame at mid-scan [m].
-
-    Notes
-    -----
-    The counterpart, for points, of what `rol.radar.polar_to_cartesian` does to an image that is given a twist.
     """
-    points = check_points(points, "cloud", error=OdometryError)
-    turn = radar.SCAN_SECONDS if scan_seconds is None else scan_seconds
-    doppler = radar.DOPPLER_SECONDS if doppler_seconds is None else doppler_seconds
-    bearings, ranges = np.arctan2(points[:, 1], points[:, 0]), np.hypot(points[:, 0], points[:, 1])
-    nearer = radar.doppler_shift(bearings, twist, doppler) / np.maximum(ranges, 1e-9)
-    seconds = (np.mod(-bearings, 2.0 * np.pi) / (2.0 * np.pi) - 0.5) * turn
-    return radar.deskew_points(points * (1.0 - nearer)[:, None], seconds, twist)
+    return compensate_points(check_points(points, "cloud", error=OdometryError), ScanMotion(twist))
 
 
 def build_local_map(clouds: Sequence[np.ndarray], settings: MapSettings) -> LocalMap | None:
@@ -389,37 +370,75 @@ def local_map_odometry(
         not finite.
     """
     stamps_us = _check_stamps(stamps_us)
-    tracker, n_clouds = _Tracker(settings, deskew, first_twist), 0
+    odometry, n_clouds = LocalMapOdometry(settings, deskew=deskew, first_twist=first_twist), 0
     for cloud in clouds:
         if n_clouds == len(stamps_us):
             raise OdometryError(f"{n_clouds} stamps, but more clouds")
-        cloud = check_points(cloud, f"cloud {n_clouds}", error=OdometryError)
-        if n_clouds == 0:
-            tracker.begin(cloud)
-        else:
-            yield tracker.follow(cloud, int(stamps_us[n_clouds] - stamps_us[n_clouds - 1]) / 1e6)
+        increment = odometry.step(cloud, int(stamps_us[n_clouds]))
+        if increment is not None:
+            yield increment
         n_clouds += 1
     if n_clouds < len(stamps_us):
         raise OdometryError(f"{len(stamps_us)} stamps for {n_clouds} clouds")
 
 
-class _Tracker:
-    """State of `local_map_odometry` after a scan; its frame is that of the first scan."""
+class LocalMapOdometry:
+    """Local-map odometry that is given one scan at a time; its frame is that of the first scan.
+
+    Parameters
+    ----------
+    settings : LocalMapSettings
+        Map, registration and plausibility.
+    deskew, first_twist
+        As for `local_map_odometry`.
+    """
 
     def __init__(
         self,
-        settings: LocalMapSettings,
-        deskew: Callable[[np.ndarray, np.ndarray], np.ndarray] | None,
-        first_twist: np.ndarray | None,
+        settings: LocalMapSettings = LocalMapSettings(),
+        *,
+        deskew: Callable[[np.ndarray, np.ndarray], np.ndarray] | None = deskew_cloud,
+        first_twist: np.ndarray | None = None,
     ) -> None:
         self.settings = settings
         self.fine = replace(settings.icp, start_scale_m=settings.icp.end_scale_m)
         self.deskew = deskew or (lambda cloud, twist: cloud)
         self.is_twist_known = first_twist is not None
         self.twist = check_poses(first_twist, "first twist") if self.is_twist_known else np.zeros(3)
-        self.pose = np.zeros(3)
+        self.pose, self.n_scans, self.stamp_us = np.zeros(3), 0, 0
 
-    def begin(self, cloud: np.ndarray) -> None:
+    def step(self, cloud: np.ndarray, stamp_us: int) -> LocalMapIncrement | None:
+        """Estimate the motion from the last scan to this one.
+
+        Parameters
+        ----------
+        cloud : array, shape (n, 2)
+            Points of the scan in its own frame [m].
+        stamp_us : int
+            Time of the scan [us].
+
+        Returns
+        -------
+        increment : LocalMapIncrement or None
+            None for the first scan.
+
+        Raises
+        ------
+        OdometryError
+            If the time does not increase, or the cloud has another shape or a value that is not finite.
+        """
+        cloud = check_points(cloud, f"cloud {self.n_scans}", error=OdometryError)
+        seconds, increment = (stamp_us - self.stamp_us) / 1e6, None
+        if self.n_scans == 0:
+            self._begin(cloud)
+        elif seconds <= 0.0:
+            raise OdometryError(f"stamps do not increase at index {self.n_scans}")
+        else:
+            increment = self._follow(cloud, seconds)
+        self.n_scans, self.stamp_us = self.n_scans + 1, stamp_us
+        return increment
+
+    def _begin(self, cloud: np.ndarray) -> None:
         """Start a local map with a cloud, which is deskewed again until the first accepted motion."""
         self.anchor: tuple[np.ndarray, np.ndarray] | None = (self.pose, cloud)
         self.keyframes: list[tuple[np.ndarray, np.ndarray]] = []
@@ -427,11 +446,11 @@ class _Tracker:
         # The last accepted pose, and the time since then.
         self.accepted_pose, self.blind_s = self.pose, 0.0
 
-    def follow(self, cloud: np.ndarray, seconds: float) -> LocalMapIncrement:
+    def _follow(self, cloud: np.ndarray, seconds: float) -> LocalMapIncrement:
         """Estimate the motion to the next scan."""
         self.blind_s += seconds
         last_pose = self.pose
-        guess = self.pose = compose(last_pose, exp(self.twist * seconds))
+        guess = self.pose = compose(last_pose, exp(self.twist, seconds))
         is_easy = self.is_twist_known and self.blind_s <= 0.5
         for is_searched in (False, True) if is_easy else (True,):
             pose, inlier_ratio = self._register(cloud, guess, is_searched)
@@ -441,7 +460,7 @@ class _Tracker:
                 break
         if fault and (self.anchor is not None or self.blind_s > self.settings.plausibility.patience_s):
             self.is_twist_known = False
-            self.begin(cloud)
+            self._begin(cloud)
         return LocalMapIncrement(relative_pose(last_pose, self.pose), self.twist, inlier_ratio, fault)
 
     def _register(self, cloud: np.ndarray, guess: np.ndarray, is_searched: bool) -> tuple[np.ndarray, float]:

@@ -197,46 +197,37 @@ def _window_sums(values: np.ndarray, window: int) -> np.ndarray:
     return (sums[window:] - sums[:-window])[:: max(window // 2, 1)]
 
 
-class OdometryGate:
-    """Gate that replaces implausible increments by the last plausible one.
+def gate_odometry(
+    increments: Iterable[np.ndarray],
+    *,
+    max_change: tuple[float, float] = (0.6, np.deg2rad(2.5)),
+    patience: int = 3,
+) -> Iterator[np.ndarray]:
+    """Replace implausible increments by the last plausible one.
 
     Parameters
     ----------
+    increments : iterable of array, shape (3,)
+        Odometry at a constant rate [m, m, rad].
     max_change : tuple of float
         Largest change from one increment to the next, forward [m] and in heading [rad]. At 4 Hz 0.6 m correspond to an
         acceleration of 10 m/s2, full braking, and 2.5 deg are more than twice the change at the entry of a bend.
     patience : int
         After this number of rejected increments in a row the next one is accepted: then the reference was wrong.
-    """
-
-    def __init__(self, max_change: tuple[float, float] = (0.6, np.deg2rad(2.5)), patience: int = 3) -> None:
-        self.max_change, self.patience = max_change, patience
-        self.last: np.ndarray | None = None
-        self.n_rejected = 0
-
-    def __call__(self, increment: np.ndarray) -> np.ndarray:
-        """Return the increment, or the last plausible one in its place, shape (3,) [m, m, rad]."""
-        increment = check_poses(increment, "odometry increment")
-        if self.last is not None and self.n_rejected < self.patience:
-            change = abs(increment[0] - self.last[0]), abs(float(wrap_angle(increment[2] - self.last[2])))
-            if change[0] > self.max_change[0] or change[1] > self.max_change[1]:
-                self.n_rejected += 1
-                return self.last.copy()
-        self.last, self.n_rejected = increment, 0
-        return increment
-
-
-def gate_odometry(increments: Iterable[np.ndarray]) -> Iterator[np.ndarray]:
-    """Replace implausible increments by the last plausible one, see `OdometryGate`.
-
-    Parameters
-    ----------
-    increments : iterable of array, shape (3,)
-        Odometry [m, m, rad].
 
     Yields
     ------
     increment : array, shape (3,)
         As many as given.
     """
-    return map(OdometryGate(), increments)
+    last, n_rejected = None, 0
+    for increment in increments:
+        increment = check_poses(increment, "odometry increment")
+        if last is not None and n_rejected < patience:
+            change = abs(increment[0] - last[0]), abs(float(wrap_angle(increment[2] - last[2])))
+            if change[0] > max_change[0] or change[1] > max_change[1]:
+                n_rejected += 1
+                yield last.copy()
+                continue
+        last, n_rejected = increment, 0
+        yield increment

@@ -615,4 +615,23 @@ class RecoveringFilter:
 
 
 def mean_increment(increment: np.ndarray, motion: MotionModel) -> np.ndarray:
+    """Compute the median of 256 sampled increments, with a fixed seed.
+
+    Parameters
+    ----------
+    increment : array, shape (3,)
+        Odometry [m, m, rad].
+    motion : MotionModel
+        Its distribution.
+
+    Returns
+    -------
+    increment : array, shape (3,)
+        Typical increment [m, m, rad].
+
+    Notes
+    -----
+    ``motion.mean`` is exact. It differs from this by 12 mm and 5 mm (RMS, forward and left) and changes the RMSE over 1,500
+    scans of the real route by up to 1.4 mm, so the reference results would have to be renewed.
+    """
     return np.median(predict(np.zeros((256, 3)), increment, motion, np.random.default_rng(0)), axis=0)

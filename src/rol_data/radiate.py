@@ -1,8 +1,8 @@
-"""Real pairs of a radar scan and a lidar sweep from RADIATE, a data set in bad weather (Sheeny et al. 2021).
+"""Read real pairs of a radar scan and a lidar sweep from RADIATE, a data set in bad weather (Sheeny et al. 2021).
 
-The small sample that comes with its kit holds 18 consecutive scans of a CTS350-X, the paper's radar, and the
+The small sample that comes with its SDK holds 18 consecutive scans of a CTS350-X, the paper's radar, and the
 nearest sweep of an HDL-32E, the paper's lidar, in fog. The radar's files differ from Oxford's: bins four times as
-long, no stamps in the rows, another code. Frame: that of the radar, x forward, y left, z up [m].
+long, no stamps in the rows, another scale of power. Frame: that of the radar, x forward, y left, z up [m].
 """
 
 from __future__ import annotations
@@ -11,7 +11,10 @@ import re
 from dataclasses import dataclass
 from pathlib import Path
 
+import cv2
 import numpy as np
+import pandas as pd
+import yaml
 
 from rol.files import read_text
 
@@ -36,7 +39,7 @@ class RadiatePair:
     power : array, shape (400, 576), uint8
         The scan, one row per azimuth, one column per range bin.
     points : array, shape (n, 4)
-        The sweep in the radar frame: x, y, z [m], intensity. The car's motion is not taken out.
+        The sweep in the radar frame: x, y, z [m], intensity. The vehicle's motion is not compensated.
     gap_s : float
         Time of the sweep after that of the scan, as the lists of times give both [s].
     """
@@ -49,7 +52,7 @@ class RadiatePair:
 
 
 def radiate_azimuths() -> np.ndarray:
-    """Give the bearings of the rows, counter-clockwise and so decreasing, shape (400,) [rad]."""
+    """Return the bearings of the rows, counter-clockwise and so decreasing, shape (400,) [rad]."""
     return -2.0 * np.pi * np.arange(N_AZIMUTHS) / N_AZIMUTHS
 
 
@@ -91,7 +94,7 @@ def load_pairs(real_root: Path | str) -> list[RadiatePair]:
 
 
 def _load_times(path: Path) -> dict[str, float]:
-    """Number of a file -> its time [s]."""
+    """Read the times of the files [s], by their numbers."""
     if not path.is_file():
         raise RadiateError(f"{path}: missing")
     found = re.findall(r"Frame: (\d+) Time: ([\d.]+)", read_text(path, RadiateError))
@@ -101,9 +104,7 @@ def _load_times(path: Path) -> dict[str, float]:
 
 
 def _load_lidar_place(path: Path) -> np.ndarray:
-    """Where the lidar sits in the radar frame [m]. Its file has the lidar's axes: x to the right, y forward."""
-    import yaml
-
+    """Read the position of the lidar in the radar frame [m]; the file has x to the right, y forward."""
     try:
         place = yaml.safe_load(read_text(path))["lidar_calib"]["T"]
         right, forward, up = (float(value) for value in place)
@@ -113,8 +114,6 @@ def _load_lidar_place(path: Path) -> np.ndarray:
 
 
 def _load_power(path: Path) -> np.ndarray:
-    import cv2
-
     image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
     if image is None or image.shape != (N_BINS, N_AZIMUTHS) or image.dtype != np.uint8:
         shape = None if image is None else image.shape
@@ -123,9 +122,7 @@ def _load_power(path: Path) -> np.ndarray:
 
 
 def _load_sweep(path: Path) -> np.ndarray:
-    """Points with the axes turned: x forward, y left, z up, intensity."""
-    import pandas as pd
-
+    """Read a sweep and turn its axes: x forward, y left, z up, intensity."""
     try:
         table = pd.read_csv(path, header=None, dtype=np.float64).to_numpy()
     except (ValueError, pd.errors.ParserError) as error:

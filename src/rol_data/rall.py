@@ -1,8 +1,8 @@
-"""The small pieces of real data: the lidar map, true poses and radar odometry of the paper's sessions.
+"""Read the lidar map, ground truth and radar odometry of the paper's sessions, and single scans.
 
-They were published by the paper's first author with a later work (Yin et al., "RaLL", T-ITS 2021). The files
-lie under a folder that is called `real_root` everywhere, in the layout of the public repositories, see
-`data/README.md`. All poses are (x, y, yaw) in the frame of the map [m, m, rad], y left, yaw counter-clockwise.
+The paper's first author published them with a later work (Yin et al., "RaLL", T-ITS 2021). The files lie in a folder
+that is called `real_root`, in the layout of the public repositories, see `data/README.md`. All poses are (x, y, yaw)
+in the frame of the map [m, m, rad], y left, yaw counter-clockwise.
 """
 
 from __future__ import annotations
@@ -12,9 +12,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import cv2
 import numpy as np
 
 from rol.files import read_text
+from rol.geometry import log, relative_pose
+from rol.oxford import compose_odometry, load_radar, load_radar_odometry
+from rol.pairs import estimate_twists
 
 MAP_PATH = Path("RaLL/data/maps/RobotCar/png/oxford_laser_map.png")
 POSES_PATH = Path("RaLL/data/gt_poses/RobotCar")
@@ -22,11 +26,8 @@ ODOMETRY_PATH = Path("RaLL/data/odom/RobotCar")
 SCANS_PATH = Path("RadarSLAMPy/data/tiny")
 SCAN_POSES_PATH = Path("oxford_scan_map_poses.csv")  # in no public repository, so it comes with the book
 MAP_CELL = 0.25  # side of a pixel of the map [m]
-MAP_SHAPE = (8000, 8000)  # of the published picture; of another one nobody knows where its pixels lie
-MAP_CORNER = (
-    1500.0,
-    800.0,
-)  # x at the upper edge of the first row, y at the left edge of the first column [m]
+# Of the published image; x at the upper edge of the first row, y at the left edge of the first column [m].
+MAP_SHAPE, MAP_CORNER = (8000, 8000), (1500.0, 800.0)
 
 
 class RallError(ValueError):
@@ -48,7 +49,7 @@ class RealScan:
     pose : array, shape (3,)
         Pose of the radar at mid-scan in the frame of the map [m, m, rad].
     twist : tuple of float, or None
-        Body velocity [m/s, m/s, rad/s]; None where nothing tells it.
+        Body velocity [m/s, m/s, rad/s]; None if unknown.
     """
 
     path: Path
@@ -90,27 +91,25 @@ def find_scan_poses(real_root: Path | str) -> Path:
 
 
 def load_map_points(path: Path | str, shape: tuple[int, int] | None = None) -> np.ndarray:
-    """Read the lidar map, a picture of occupied cells.
+    """Read the lidar map, an image of occupied cells.
 
     Parameters
     ----------
     path : path
         PNG of 0.25 m per pixel, zero for free, 255 for occupied; x points up and y to the left.
     shape : tuple of int, optional
-        Rows and columns that the picture must have, such as ``MAP_SHAPE``; any if not given.
+        Rows and columns that the image must have, such as ``MAP_SHAPE``; any if not given.
 
     Returns
     -------
     points : array, shape (n, 2)
-        Middles of the occupied cells in the map frame [m].
+        Centres of the occupied cells in the map frame [m].
 
     Raises
     ------
     RallError
-        If the file is missing, no grey picture, of another size, with other values, or empty.
+        If the file is missing, no grey image, of another size, with other values, or empty.
     """
-    import cv2
-
     path = Path(path)
     image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED) if path.is_file() else None
     if image is None:
@@ -125,13 +124,12 @@ def load_map_points(path: Path | str, shape: tuple[int, int] | None = None) -> n
     rows, columns = np.nonzero(image)
     if len(rows) == 0:
         raise RallError(f"{path}: the map holds no occupied cell")
-    return np.column_stack([
-        MAP_CORNER[0] - MAP_CELL * (rows + 0.5), MAP_CORNER[1] - MAP_CELL * (columns + 0.5)
-    ])  # fmt: skip
+    x, y = MAP_CORNER
+    return np.column_stack([x - MAP_CELL * (rows + 0.5), y - MAP_CELL * (columns + 0.5)])
 
 
 def load_poses(path: Path | str) -> np.ndarray:
-    """Read the true poses of a session in the frame of the map.
+    """Read the ground truth of a session in the frame of the map.
 
     Parameters
     ----------
@@ -152,7 +150,7 @@ def load_poses(path: Path | str) -> np.ndarray:
 
 
 def load_odometry(path: Path | str) -> np.ndarray:
-    """Read the authors' own radar odometry, ICP between generated clouds.
+    """Read the authors' radar odometry, ICP between generated clouds.
 
     Parameters
     ----------
@@ -161,8 +159,8 @@ def load_odometry(path: Path | str) -> np.ndarray:
 
     Returns
     -------
-    steps : array, shape (n, 3)
-        Steps [m, m, rad]. Files 01 and 02 hold one row more than there are steps.
+    increments : array, shape (n, 3)
+        Odometry increments [m, m, rad]. Files 01 and 02 hold one row too many.
 
     Raises
     ------
@@ -208,7 +206,7 @@ def load_scan_poses(path: Path | str) -> dict[int, np.ndarray]:
 
 
 def load_scans(real_root: Path | str) -> list[RealScan]:
-    """Read all real radar scans whose pose on the map is known.
+    """Read all real radar scans with a known pose on the map.
 
     Parameters
     ----------
@@ -219,8 +217,8 @@ def load_scans(real_root: Path | str) -> list[RealScan]:
     -------
     scans : list of RealScan
         In the order of time: every scan under ``RadarSLAMPy/data/tiny/radar`` with a row in
-        ``oxford_scan_map_poses.csv``, see `find_scan_poses`. The velocity is that of the official odometry beside the scans; of a scan
-        that it does not cover, that between the poses of neighbours less than a second away, if there is one.
+        ``oxford_scan_map_poses.csv``, see `find_scan_poses`. The velocity is that of the official odometry beside the
+        scans; outside its span, that between the poses of neighbours less than a second away, if there is one.
 
     Raises
     ------
@@ -229,8 +227,6 @@ def load_scans(real_root: Path | str) -> list[RealScan]:
     rol.oxford.OxfordError
         If a scan or the odometry is at fault.
     """
-    from rol.oxford import load_radar
-
     folder, poses = Path(real_root) / SCANS_PATH / "radar", load_scan_poses(find_scan_poses(real_root))
     stamps = sorted(stamp for stamp in poses if (folder / f"{stamp}.png").is_file())
     if not stamps:
@@ -248,19 +244,19 @@ def load_scans(real_root: Path | str) -> list[RealScan]:
 
 
 def group_scans(stamps_us: Sequence[int], max_gap_s: float = 1.0) -> list[list[int]]:
-    """Divide scans into drives: a new one begins after a long gap.
+    """Divide scans into groups without a long gap in time.
 
     Parameters
     ----------
     stamps_us : sequence of int
         Times of the scans [us], in order.
     max_gap_s : float
-        Scans more than this apart are not of one drive [s].
+        Largest gap between scans of one group [s].
 
     Returns
     -------
     groups : list of list of int
-        Indices of the scans of each drive, in the order of time; none is empty.
+        Indices of the scans of each group, in the order of time; none is empty.
 
     Raises
     ------
@@ -280,10 +276,7 @@ def group_scans(stamps_us: Sequence[int], max_gap_s: float = 1.0) -> list[list[i
 
 
 def _official_twists(path: Path, stamps: list[int]) -> dict[int, tuple[float, float, float]]:
-    """Velocity of the scans that the official odometry covers; none where its steps are no chain."""
-    from rol.oxford import compose_odometry, load_radar_odometry
-    from rol.pairs import estimate_twists
-
+    """Estimate the velocity of the scans that the official odometry covers; none if it has gaps."""
     if not path.is_file():
         return {}
     odometry = load_radar_odometry(path)
@@ -295,16 +288,14 @@ def _official_twists(path: Path, stamps: list[int]) -> dict[int, tuple[float, fl
 
 
 def _twists_between(poses: dict[int, np.ndarray]) -> dict[int, tuple[float, float, float]]:
-    """Velocity of scans from the poses of their neighbours less than a second away."""
-    from rol.geometry import relative_pose
-
+    """Estimate the velocity of scans from the poses of their neighbours less than a second away."""
     stamps, found = sorted(poses), {}
     for i, stamp in enumerate(stamps):
         near = [other for other in stamps[max(i - 1, 0) : i + 2] if abs(other - stamp) < 1_000_000]
         if len(near) > 1:
-            dx, dy, turn = relative_pose(poses[near[0]], poses[near[-1]])
-            c, s, seconds = np.cos(turn / 2.0), np.sin(turn / 2.0), (near[-1] - near[0]) * 1e-6
-            found[stamp] = tuple(float(v) / seconds for v in (c * dx + s * dy, c * dy - s * dx, turn))
+            seconds = (near[-1] - near[0]) * 1e-6
+            twist = log(relative_pose(poses[near[0]], poses[near[-1]])) / seconds
+            found[stamp] = tuple(float(value) for value in twist)
     return found
 
 

@@ -17,7 +17,7 @@ from rol.geometry import relative_pose
 from rol.oxford import RadarOdometry
 from rol.pairs import estimate_twists
 from rol.pix2pix import TrainedNetwork
-from rol_beyond.front_ends import translate_scan
+from rol_beyond.front_ends import generate_points
 from rol_data import rall
 from rol_sim.session.settings import parse_settings
 from rol_sim.session.simulation import SimulatedSession, build_session, make_scan
@@ -34,7 +34,7 @@ def render_points(
     seed: int,
     *,
     bf16: bool = False,
-    headings: int | None = None,
+    tta_rotations: int | None = None,
     **changes: Any,
 ) -> Iterator[np.ndarray]:
     """Generate the lidar points of a segment of a real session, scan by scan, as its radar might have led to them.
@@ -54,9 +54,8 @@ def render_points(
         From `rol.pix2pix.load_network`; threshold and thinning are its own.
     seed : int
         Draws all that is simulated: the same seed, the same world for all sessions, each on a day of its own.
-    bf16, headings
-        Of `rol_beyond.front_ends.translate_scan`: multiply in bfloat16; quarter turns to average, the network's own number if not
-        given.
+    bf16, tta_rotations
+        Of `rol_beyond.front_ends.generate_points`.
     **changes
         Settings of `SessionSettings` other than those of the twins in chapter 1, such as ``changed_share``.
 
@@ -85,7 +84,7 @@ def render_points(
     surroundings of the eleven real scans and of one more place (``sets`` in its card). Clouds from there flatter it.
     """
     session = build_segment(real_root, number, first_scan, n_scans, seed, **changes)
-    return _translate(session, network, bf16=bf16, headings=headings)
+    return _generate(session, network, bf16=bf16, tta_rotations=tta_rotations)
 
 
 def build_segment(
@@ -113,10 +112,10 @@ def build_segment(
     return build_session(parse_settings(section, str(path)), name)
 
 
-def _translate(session: SimulatedSession, network: TrainedNetwork, **how: Any) -> Iterator[np.ndarray]:
+def _generate(session: SimulatedSession, network: TrainedNetwork, **how: Any) -> Iterator[np.ndarray]:
     for index, twist in enumerate(true_twists(session)):
         scan = make_scan(session, index)
-        yield translate_scan(network, scan.power, scan.azimuths, tuple(twist), **how)[0]
+        yield generate_points(network, scan.power, scan.azimuths, tuple(twist), **how)[0]
 
 
 def true_twists(session: SimulatedSession) -> np.ndarray:

@@ -20,12 +20,11 @@ import pandas as pd
 import yaml
 from scipy.spatial import cKDTree
 
-from rol.alignment import align_scans, usable_sweeps
 from rol.bev import image_to_points
 from rol.evaluation import read_tum
 from rol.files import read_text, write_text
-from rol.oxford import compose_odometry, load_radar_odometry, open_session
-from rol.pairs import estimate_twists, job_of_row
+from rol.oxford import Session, compose_odometry, load_radar_odometry, open_session
+from rol.pairs import AlignedScan, PairSettings, align_scans, estimate_twists, usable_sweeps
 from rol.pix2pix import (
     Generator,
     TrainConfig,
@@ -37,8 +36,8 @@ from rol.pix2pix import (
 )
 from rol.similarity import similarity_summary
 from rol.training import RunOptions, train
-from rol_beyond.front_ends import MIN_RANGE_M, judge_on_map, translate_scan
-from rol_beyond.scan_pairs import JoinedPairs, ScanPairs, gather_clouds
+from rol_beyond.augmentation import JoinedPairs, ScanPairs, gather_clouds
+from rol_beyond.front_ends import MIN_RANGE_M, evaluate_on_map, generate_points
 from rol_beyond.training_options import TrainingExtensions
 from rol_data import rall
 from rol_sim.session.settings import parse_settings
@@ -121,35 +120,36 @@ def make_sessions(recipe: dict[str, Any], names: set[str], places: Places) -> No
         )
 
 
-def choose_jobs(root: Path, part: dict[str, Any], motion: str) -> tuple[Any, list[dict[str, Any]]]:
+def choose_scans(root: Path, part: dict[str, Any], motion: str) -> tuple[Session, list[AlignedScan]]:
     """Open a session, align its scans and select those of a set; scans of a stationary vehicle are left out."""
     session = open_session(root / part["session"])
     odometry = load_radar_odometry(session.odometry_path)
     radar_us, mid_us, _ = compose_odometry(odometry)
     scans = (radar_us, mid_us, estimate_twists(odometry))
     rows = align_scans(*scans, usable_sweeps(session), motion=motion, max_gap_us=50_000)
-    jobs = [job_of_row(row) for _, row in pd.DataFrame(rows).iterrows()]
+    aligned = [AlignedScan.from_row(row) for _, row in pd.DataFrame(rows).iterrows()]
     stamps_us, poses = read_tum(session.root / "truth.tum")
-    positions = poses[np.searchsorted(stamps_us, [job["radar_stamp"] for job in jobs]), :2]
+    positions = poses[np.searchsorted(stamps_us, [one.radar_stamp_us for one in aligned]), :2]
     within = [np.hypot(*(positions - disc[:2]).T) < disc[2] for disc in part.get("within", [])]
     without = [np.hypot(*(positions - disc[:2]).T) < disc[2] for disc in part.get("without", [])]
-    chosen = np.any(within, axis=0) if within else np.ones(len(jobs), dtype=bool)
+    chosen = np.any(within, axis=0) if within else np.ones(len(aligned), dtype=bool)
     chosen &= ~np.any(without, axis=0) if without else True
     chosen &= np.hypot(*np.diff(positions, axis=0, prepend=positions[:1] + 9.0).T) > 0.2
-    return session, [jobs[i] for i in np.flatnonzero(chosen)[:: part.get("every", 1)]]
+    return session, [aligned[i] for i in np.flatnonzero(chosen)[:: part.get("every", 1)]]
 
 
 def open_set(recipe: dict[str, Any], name: str, places: Places, stride: int = 1) -> JoinedPairs:
     """Open one set of pairs, or every `stride`-th pair of it; its lidar points are read once and kept."""
-    root, out, settings = Path(recipe["sessions_root"]), Path(recipe["out_dir"]), recipe["pairs"]
-    parts = []
+    root, out = Path(recipe["sessions_root"]), Path(recipe["out_dir"])
+    settings, parts = PairSettings.from_dict(recipe["pairs"]), []
     for part in recipe["sets"][name]:
-        session, jobs = choose_jobs(root, part, settings["motion"])
-        jobs = jobs[::stride]
-        path = out / "clouds" / f"{part['session']}-{zlib.crc32(repr(jobs).encode()):08x}.npz"
+        session, aligned = choose_scans(root, part, settings.motion)
+        aligned = aligned[::stride]
+        path = out / "clouds" / f"{part['session']}-{zlib.crc32(repr(aligned).encode()):08x}.npz"
         how = {"workers": places.threads, "report": places.report}
-        parts.append(ScanPairs(session, jobs, gather_clouds(session, jobs, path, settings, **how), settings))
-        places.report(f"{name}: {len(jobs)} pairs of {part['session']}")
+        clouds = gather_clouds(session, aligned, path, settings, **how)
+        parts.append(ScanPairs(session, aligned, clouds, settings))
+        places.report(f"{name}: {len(aligned)} pairs of {part['session']}")
     return JoinedPairs(parts)
 
 
@@ -213,10 +213,10 @@ def evaluate_network(
     ]
     rows = []
     for scan in [] if real is None else real[0]:
-        _, _, generated = translate_scan(network, scan.power, scan.azimuths, scan.twist)
+        _, _, generated = generate_points(network, scan.power, scan.azimuths, scan.twist)
         for threshold in THRESHOLDS:
             points = image_to_points(generated, threshold=threshold, min_range=MIN_RANGE_M, thin=thin)
-            found = judge_on_map(points, scan.pose, real[1])
+            found = evaluate_on_map(points, scan.pose, real[1])
             near = {f"fake_to_real_within_{r}m": found[f"share_{r}m"] for r in (1, 2)}
             rows.append({"threshold": threshold, "n_fake": found["n"], **near})
     if rows:

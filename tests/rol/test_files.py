@@ -11,8 +11,7 @@ import pytest
 
 import chapters
 from rol import evaluation, files, maps, oxford, pairs
-from rol.fakes import prepare_fakes
-from rol.pairs import prepare_pairs
+from rol.pairs import generated_folder, pair_folder
 from rol_data import rall
 from rol_sim.session import oxford_files
 from rol_sim.session.settings import load_settings
@@ -40,7 +39,7 @@ WRITERS = {
     "radar.timestamps": lambda path: oxford_files.save_timestamps(path, np.array([1, 2])),
     "1.bin": lambda path: oxford_files.save_velodyne_binary(path, np.ones((3, 4))),
     "weights.safetensors": save_history,
-    "settings.json": lambda path: prepare_fakes(path.parent, {"weights": "a"}),
+    "settings.json": lambda path: generated_folder(path.parent).prepare({"weights": "a"}),
 }
 
 
@@ -119,10 +118,10 @@ def test_a_byte_order_mark_changes_nothing(text: str, read: Callable[[Path], obj
 # ---- folders that are cleared ----
 
 
-@pytest.mark.parametrize("prepare", [prepare_pairs, prepare_fakes])
+@pytest.mark.parametrize("kind", [pair_folder, generated_folder])
 @pytest.mark.parametrize("marker", [None, "{}", "[]", '{"a": 1', '{"format": 4, "session": {}}'])
 def test_folders_of_others_are_left_alone(
-    prepare: Callable[..., set[int]], marker: str | None, tmp_path: Path
+    kind: Callable[..., files.ImageFolder], marker: str | None, tmp_path: Path
 ) -> None:
     names = ("radar/1.png", "lidar/1.png", "2.png", "fake.json", "pairs.json")
     for name in names:
@@ -130,35 +129,35 @@ def test_folders_of_others_are_left_alone(
     if marker is not None:
         files.write_text(tmp_path / "settings.json", marker)
     with pytest.raises(ValueError, match=f"{tmp_path.name}: not empty.*nothing was removed. Choose another"):
-        prepare(tmp_path, {"motion": "none"})
+        kind(tmp_path).prepare({"motion": "none"})
     assert all(files.read_text(tmp_path / name) == "raw" for name in names)
 
 
 def test_each_kind_of_folder_is_cleared_by_its_own_function_only(tmp_path: Path) -> None:
-    prepare_pairs(tmp_path, {"motion": "none"})
+    pair_folder(tmp_path).prepare({"motion": "none"})
     with pytest.raises(ValueError, match=r"not made for fake\.json"):
-        prepare_fakes(tmp_path, {})
+        generated_folder(tmp_path).prepare({})
 
 
 def test_images_behind_a_symbolic_link_are_left_alone(tmp_path: Path) -> None:
-    prepare_pairs(tmp_path / "pairs", {"motion": "none"})
+    pair_folder(tmp_path / "pairs").prepare({"motion": "none"})
     (tmp_path / "raw").mkdir()
     (tmp_path / "raw" / "1.png").write_bytes(b"raw")
     (tmp_path / "pairs" / "radar").symlink_to(tmp_path / "raw")
     with pytest.raises(ValueError, match="radar: a symbolic link"):
-        prepare_pairs(tmp_path / "pairs", {"motion": "corrected"})
+        pair_folder(tmp_path / "pairs").prepare({"motion": "corrected"})
     assert (tmp_path / "raw" / "1.png").read_bytes() == b"raw"
 
 
 def test_only_known_files_are_removed(tmp_path: Path) -> None:
     (tmp_path / ".DS_Store").touch()
-    assert prepare_pairs(tmp_path, {"motion": "none"}) == set()
+    assert pair_folder(tmp_path).prepare({"motion": "none"}) == set()
     pairs.save_pair(tmp_path, 7, IMAGE, IMAGE)
     for name in ("radar/notes.txt", "radar/plan.png", "thesis.txt", "radar/.8.png.17.tmp"):
         files.write_text(tmp_path / name, "mine")
-    assert prepare_pairs(tmp_path, {"motion": "none"}) == {7}
+    assert pair_folder(tmp_path).prepare({"motion": "none"}) == {7}
     assert not (tmp_path / "radar/.8.png.17.tmp").exists()  # of a run that was killed
-    assert prepare_pairs(tmp_path, {"motion": "corrected"}) == set()
+    assert pair_folder(tmp_path).prepare({"motion": "corrected"}) == set()
     left = {path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*") if path.is_file()}
     assert left == {".DS_Store", "settings.json", "thesis.txt", "radar/notes.txt", "radar/plan.png"}
 

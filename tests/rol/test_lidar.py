@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from rol.geometry import transform_from_euler
-from rol.lidar import crop_range, relate_sensors, remove_ground, sweep_to_radar, threshold_losses
+from rol.lidar import crop_range, ground_removal_tradeoff, relate_sensors, remove_ground, sweep_to_radar
 
 
 def test_calibration_by_hand():
@@ -49,11 +49,11 @@ def test_crop_range_is_measured_in_the_plane():
 def test_threshold_losses_by_hand():
     heights = np.array([-2.0, -1.9, -1.8, -1.4, -1.9, -1.0, 0.0, 1.0, 2.0])
     is_ground = np.array([1, 1, 1, 1, 0, 0, 0, 0, 0], dtype=bool)
-    ground, objects = threshold_losses(heights, is_ground, np.array([-3.0, -1.8, -1.5, 3.0]))
+    ground, objects = ground_removal_tradeoff(heights, is_ground, np.array([-3.0, -1.8, -1.5, 3.0]))
     np.testing.assert_allclose(ground, [0.0, 0.5, 0.75, 1.0])
     np.testing.assert_allclose(objects, [0.0, 0.2, 0.2, 1.0])
     for threshold, lost in zip([-1.8, -1.5], [3, 4], strict=True):  # the same rule as remove_ground's
         assert len(heights) - len(remove_ground(np.tile(heights[:, None], 3), threshold)) == lost
-    assert np.isnan(threshold_losses(heights, ~np.zeros(9, dtype=bool), np.array([0.0]))[1]).all()
+    assert np.isnan(ground_removal_tradeoff(heights, ~np.zeros(9, dtype=bool), np.array([0.0]))[1]).all()
     with pytest.raises(ValueError, match="labels"):
-        threshold_losses(heights, is_ground[:3], np.array([0.0]))
+        ground_removal_tradeoff(heights, is_ground[:3], np.array([0.0]))

@@ -9,9 +9,17 @@ import pandas as pd
 import pytest
 
 from rol import oxford
-from rol.alignment import align_scans, measure_misalignment, usable_sweeps
-from rol.pairs import build_pair, estimate_twists, job_of_row, load_lidar_points
+from rol.pairs import (
+    AlignedScan,
+    PairSettings,
+    align_scans,
+    build_pair,
+    estimate_twists,
+    load_lidar_points,
+    usable_sweeps,
+)
 from rol_sim.session import oxford_files
+from rol_study.misalignment import measure_misalignment
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -39,7 +47,7 @@ def test_real_scans_are_paired_with_the_left_sweeps(left_only: oxford.Session) -
     assert {side: len(stamps) for side, stamps in sweeps_us.items()} == {"left": 257}
     table = pd.DataFrame(align_scans(*scans, sweeps_us, motion="corrected"))
     assert len(table) == 11
-    pair = build_pair(left_only, **job_of_row(table.iloc[5]), motion="corrected")
+    pair = build_pair(left_only, AlignedScan.from_row(table.iloc[5]), PairSettings("corrected"))
     assert np.hypot(*measure_misalignment(*pair, max_shift_px=16)) < 4.0  # of 0.25 m
 
 
@@ -55,7 +63,7 @@ def test_each_lidar_alone_is_read_with_its_own_mounting(left_only: oxford.Sessio
     assert left.shape == right.shape and np.abs(left - right).max() > 0.5  # its own mounting
     with pytest.raises(oxford.OxfordError, match="the session has no velodyne_left"):
         load_lidar_points(right_only, stamp, stamp)
-    with pytest.raises(ValueError, match=r"left_stamp and right_stamp are None"):
+    with pytest.raises(ValueError, match=r"left_stamp_us and right_stamp_us are None"):
         load_lidar_points(right_only, None, None)
 
 

@@ -1,7 +1,7 @@
 """Pairs: association in time, velocities, one pair out of a session, pairs as files."""
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -12,22 +12,27 @@ from rol.bev import image_to_points
 from rol.geometry import accumulate_increments, exp, relative_pose
 from rol.oxford import EXTRINSICS, RadarScan, Session
 from rol.pairs import (
+    AlignedScan,
     PairDataset,
+    PairSettings,
+    align_scans,
     associate_nearest,
     build_pair,
     describe_pairs,
     estimate_twists,
-    finish_pairs,
     list_pairs,
     load_lidar_points,
     load_pair,
-    prepare_pairs,
+    pair_folder,
     save_pair,
+    usable_stamps,
+    usable_sweeps,
     write_pairs,
 )
 from rol_sim.session.oxford_files import save_radar, save_velodyne_binary
 
 STAMP = 1_547_000_000_000_000
+ALIGNED = AlignedScan(STAMP, STAMP + 25_000, STAMP + 25_000)
 
 
 # ---- association
@@ -56,6 +61,72 @@ def test_associate_refuses():
         associate_nearest([1, 2], [])
     with pytest.raises(ValueError, match="do not increase at index 2"):
         associate_nearest([1, 2], [1, 5, 4])
+
+
+# ---- sweeps of scans
+
+
+def test_align_scans_by_hand():
+    radar = np.array([0, 250_000, 500_000])
+    twists = np.array([[1.0, 0.1, 0.01], [2.0, 0.2, 0.02], [3.0, 0.3, 0.03]])
+    sweeps = {
+        "left": np.array([10_000, 130_000, 260_000, 380_000]),
+        "right": np.array([-40_000, 120_000, 265_000, 375_000]),
+    }
+    columns = align_scans(radar, radar + 125_000, twists, sweeps)
+    np.testing.assert_array_equal(columns["radar_stamp_us"], [0, 250_000])  # nothing within 50 ms of the last
+    np.testing.assert_array_equal(columns["left_stamp_us"], [10_000, 260_000])
+    np.testing.assert_array_equal(columns["right_gap_ms"], [-40.0, 15.0])
+    columns = align_scans(radar, radar + 125_000, twists, sweeps, motion="corrected")
+    np.testing.assert_array_equal(columns["left_gap_ms"], [5.0, 5.0])
+    np.testing.assert_array_equal(columns["right_stamp_us"], [120_000, 375_000])
+    row = {name: values[1] for name, values in columns.items()}
+    expected = AlignedScan(250_000, 380_000, 375_000, mid_stamp_us=375_000, twist=(2.0, 0.2, 0.02))
+    assert AlignedScan.from_row(row) == expected
+    with pytest.raises(ValueError, match="motion must be"):
+        align_scans(radar, radar, twists, sweeps, motion="maybe")
+
+
+@pytest.mark.parametrize("side", ["left", "right"])
+def test_one_lidar_is_enough(side):
+    radar, twists, sweeps = np.array([0, 250_000]), np.zeros((2, 3)), {side: np.array([10_000, 260_000])}
+    columns = align_scans(radar, radar + 125_000, twists, sweeps)
+    assert [name for name in columns if "left" in name or "right" in name] == [
+        f"{side}_stamp_us",
+        f"{side}_gap_ms",
+    ]
+    aligned = AlignedScan.from_row({name: values[1] for name, values in columns.items()})
+    assert {aligned.left_stamp_us, aligned.right_stamp_us} == {260_000, None}
+    assert getattr(aligned, f"{side}_stamp_us") == 260_000
+    for wrong in ({}, {f"velodyne_{side}": radar}):
+        with pytest.raises(ValueError, match="sweeps_us must have the keys"):
+            align_scans(radar, radar, twists, wrong)
+
+
+def test_scans_that_are_all_too_far_from_their_sweeps_are_refused():
+    radar, twists = np.array([0, 250_000]), np.zeros((2, 3))
+    sweeps = {"left": radar + 90_000, "right": radar + 10_000}
+    with pytest.raises(
+        ValueError, match="within 50 ms of its stamp; the smallest gaps are left 90 ms, right 10 ms"
+    ):
+        align_scans(radar, radar + 125_000, twists, sweeps)
+    sweeps = {"left": radar + 90_000}
+    assert len(align_scans(radar, radar + 125_000, twists, sweeps, motion="corrected")["left_gap_ms"]) == 2
+
+
+def test_usable_stamps(tmp_path):
+    (tmp_path / "velodyne_left").mkdir()
+    for name in ("10.png", "20.bin", "40.png", "notes.txt"):
+        (tmp_path / "velodyne_left" / name).touch()
+    session = Session(tmp_path, "s", np.array([1]), np.array([10, 20, 30]), None)
+    np.testing.assert_array_equal(usable_stamps(session, "velodyne_left"), [10, 20])
+    with pytest.raises(ValueError, match="velodyne_right: no usable frame"):
+        usable_stamps(session, "velodyne_right")
+    with pytest.raises(ValueError, match="radar: no usable frame"):
+        usable_stamps(session, "radar")
+    assert list(usable_sweeps(session)) == ["left"]
+    with pytest.raises(ValueError, match="velodyne_left: no usable frame.*velodyne_right: no usable frame"):
+        usable_sweeps(Session(tmp_path, "s", np.array([1]), None, np.array([10])))
 
 
 # ---- velocities
@@ -92,7 +163,7 @@ def test_constant_acceleration_is_met_between_two_steps():
 def test_velocities_refuse_broken_chains():
     times = np.arange(4) * 250_000
     good = chain(np.zeros((4, 3)), times)
-    with pytest.raises(ValueError, match="no step"):
+    with pytest.raises(ValueError, match="no increment"):
         estimate_twists(Odometry(good.increments[:0], times[:0], times[:0]))
     with pytest.raises(ValueError, match="chain"):
         estimate_twists(Odometry(good.increments[[0, 2]], times[[0, 2]], times[[1, 3]]))
@@ -139,7 +210,7 @@ def session(tmp_path):
 
 
 def test_both_images_show_the_post_at_one_pixel(session):
-    radar_image, lidar_image = build_pair(session, STAMP, STAMP + 25_000, STAMP + 25_000)
+    radar_image, lidar_image = build_pair(session, ALIGNED)
     assert radar_image.dtype == lidar_image.dtype == np.uint8
     assert radar_image.shape == lidar_image.shape == (512, 512)
     np.testing.assert_array_equal(image_to_points(lidar_image), [[20.125, 5.125]])  # 72 m away: cropped
@@ -148,7 +219,7 @@ def test_both_images_show_the_post_at_one_pixel(session):
 
 
 def test_ground_alone_gives_an_empty_image(session):
-    assert not build_pair(session, STAMP, STAMP + 25_000, STAMP + 25_000, min_height=3.0)[1].any()
+    assert not build_pair(session, ALIGNED, PairSettings(min_height=3.0))[1].any()
 
 
 def test_correction_moves_lidar_points_to_mid_scan(session):
@@ -158,7 +229,7 @@ def test_correction_moves_lidar_points_to_mid_scan(session):
     moved = load_lidar_points(session, STAMP + 25_000, STAMP + 25_000, mid_stamp_us=mid, twist=twist)
     assert raw.shape == (10, 4)
     np.testing.assert_allclose(raw[:, :3] - moved[:, :3], np.tile([1.0, 0, 0], (10, 1)), atol=1e-5)
-    images = build_pair(session, STAMP, STAMP + 25_000, STAMP + 25_000, motion="corrected", twist=twist)
+    images = build_pair(session, replace(ALIGNED, twist=twist), PairSettings("corrected"))
     np.testing.assert_array_equal(image_to_points(images[1]), [[19.125, 5.125]])
     row = np.unravel_index(images[0].argmax(), (512, 512))[0]
     # Seen at 346 of 360 deg, 0.115 s after mid-scan: 1.15 m farther then, and 0.47 m farther without Doppler.
@@ -168,13 +239,13 @@ def test_correction_moves_lidar_points_to_mid_scan(session):
 def test_build_pair_refuses(session):
     sweeps = (STAMP + 25_000, STAMP + 25_000)
     with pytest.raises(ValueError, match="motion must be"):
-        build_pair(session, STAMP, *sweeps, motion="yes")
+        PairSettings("yes")
     with pytest.raises(ValueError, match="needs a twist"):
-        build_pair(session, STAMP, *sweeps, motion="corrected")
+        build_pair(session, ALIGNED, PairSettings("corrected"))
     with pytest.raises(ValueError, match="mid_stamp_us"):
         load_lidar_points(session, *sweeps, twist=(1, 0, 0))
     with pytest.raises(ValueError, match=str(STAMP + 1)):
-        build_pair(session, STAMP + 1, *sweeps)
+        build_pair(session, replace(ALIGNED, radar_stamp_us=STAMP + 1))
 
 
 # ---- files
@@ -200,7 +271,7 @@ def test_pair_round_trip(tmp_path):
 
 def test_broken_files_are_named(tmp_path):
     save_pair(tmp_path, 17, *images())
-    with pytest.raises(ValueError, match=r"radar.18\.png: the radar image of this pair is missing"):
+    with pytest.raises(ValueError, match=r"radar.18\.png: the image is missing"):
         load_pair(tmp_path, 18)
     path = tmp_path / "lidar/17.png"
     path.write_bytes(path.read_bytes()[:20])
@@ -219,13 +290,13 @@ def test_broken_files_are_named(tmp_path):
 
 def test_folder_is_whole_only_at_the_end(tmp_path):
     settings = {"min_height": -1.5}
-    assert prepare_pairs(tmp_path / "s", settings) == set()
+    assert pair_folder(tmp_path / "s").prepare(settings) == set()
     save_pair(tmp_path / "s", 17, *images())
     with pytest.raises(ValueError, match=r"pairs\.json: missing"):
         list_pairs(tmp_path / "s")
     with pytest.raises(ValueError, match=r"18\.png: missing"):
-        finish_pairs(tmp_path / "s", settings, [17, 18])
-    finish_pairs(tmp_path / "s", settings, [17])
+        pair_folder(tmp_path / "s").finish(settings, [17, 18])
+    pair_folder(tmp_path / "s").finish(settings, [17])
     assert list_pairs(tmp_path / "s") == [17]
     assert json.loads((tmp_path / "s/pairs.json").read_text(encoding="utf-8"))["settings"] == settings
     (tmp_path / "s/pairs.json").write_text('{"stamps_us": [1', encoding="utf-8")
@@ -234,43 +305,41 @@ def test_folder_is_whole_only_at_the_end(tmp_path):
 
 
 def test_same_settings_resume_others_start_over(tmp_path):
-    prepare_pairs(tmp_path, {"a": 1})
+    pair_folder(tmp_path).prepare({"a": 1})
     save_pair(tmp_path, 17, *images())
     save_pair(tmp_path, 18, *images())
     (tmp_path / "lidar/18.png").unlink()
-    assert prepare_pairs(tmp_path, {"a": 1}) == {17}
-    assert prepare_pairs(tmp_path, {"a": 2}) == set()
+    assert pair_folder(tmp_path).prepare({"a": 1}) == {17}
+    assert pair_folder(tmp_path).prepare({"a": 2}) == set()
     assert not list(tmp_path.rglob("*.png"))
 
 
 def test_description_changes_with_what_it_depends_on(session, tmp_path):
     alignment = tmp_path / "alignment.csv"
     alignment.write_text("radar_stamp_us\n1\n", encoding="utf-8")
-    first = describe_pairs(session, alignment, {"min_height": -1.5})
-    assert first == describe_pairs(session, alignment, {"min_height": -1.5})
+    first = describe_pairs(session, alignment, PairSettings())
+    assert first == describe_pairs(session, alignment, PairSettings())
     assert first["min_height"] == -1.5 and first["session"] == "tiny"
     (session.root / "session.json").write_text("{}", encoding="utf-8")
-    second = describe_pairs(session, alignment, {"min_height": -1.5})
+    second = describe_pairs(session, alignment, PairSettings())
     alignment.write_text("radar_stamp_us\n2\n", encoding="utf-8")
-    third = describe_pairs(session, alignment, {"min_height": -1.5})
+    third = describe_pairs(session, alignment, PairSettings())
     assert [name for name in first if first[name] != second[name]] == ["made_digest"]
     assert [name for name in second if second[name] != third[name]] == ["alignment_digest"]
 
 
 @pytest.mark.parametrize("workers", [1, 2])
 def test_write_pairs(session, tmp_path, workers):
-    folder, settings = tmp_path / "pairs", {"min_height": -1.5, "width": 128}
-    prepare_pairs(folder, settings)
-    job = {"radar_stamp": STAMP, "left_stamp": STAMP + 25_000, "right_stamp": STAMP + 25_000}
-    assert list(write_pairs(session, folder, [job], settings, workers)) == [STAMP]
-    expected = build_pair(session, STAMP, STAMP + 25_000, STAMP + 25_000, width=128)
+    folder, settings = tmp_path / "pairs", PairSettings(width=128)
+    assert list(write_pairs(session, folder, [ALIGNED], settings, workers)) == [STAMP]
+    expected = build_pair(session, ALIGNED, PairSettings(width=128))
     np.testing.assert_array_equal(load_pair(folder, STAMP), expected)
 
 
 def test_dataset(tmp_path):
     for stamp in (17, 18, 19):
         save_pair(tmp_path, stamp, *images(stamp))
-    finish_pairs(tmp_path, {}, [17, 18, 19])
+    pair_folder(tmp_path).finish({}, [17, 18, 19])
     dataset = PairDataset(tmp_path)
     assert len(dataset) == 3
     radar, lidar = dataset[1]

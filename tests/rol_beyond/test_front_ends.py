@@ -1,25 +1,26 @@
-"""From a polar scan to points: detectors and networks in one frame, and the judge with the map."""
+"""From a polar scan to points: detectors and networks in one frame, and their evaluation on a map."""
 
-from pathlib import Path
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
+from rol.radar import RangeCalibration
 from rol_beyond import front_ends
-from rol_beyond.front_ends import detect_points, even_out, judge_on_map
+from rol_beyond.front_ends import detect_points, evaluate_on_map, resample_by_density
 
 AZIMUTHS = -2.0 * np.pi * (13 + 14 * np.arange(400)) / 5600
 
 
 def scan_with_spot(bearing: float, range_m: float, code: int = 140) -> np.ndarray:
     """A quiet scan with one bright echo."""
-    codes = np.full((400, 3768), 6, dtype=np.uint8)
+    power = np.full((400, 3768), 6, dtype=np.uint8)
     row = int(np.argmin(np.abs(np.angle(np.exp(1j * (AZIMUTHS - bearing))))))
     bin_ = round((range_m + 0.31) / 0.0438 - 0.5)
-    codes[row, bin_ - 1 : bin_ + 2] = code - 20
-    codes[row, bin_] = code
-    return codes
+    power[row, bin_ - 1 : bin_ + 2] = code - 20
+    power[row, bin_] = code
+    return power
 
 
 @pytest.mark.parametrize("detector", front_ends.DETECTORS)
@@ -36,16 +37,16 @@ def test_leakage_and_what_lies_beyond_the_image_are_left_out(detector: str, rang
 
 
 def test_motion_moves_points_to_mid_scan() -> None:
-    codes = scan_with_spot(-0.1, 30.0)  # seen at the very beginning of the turn
-    still, moving = (detect_points(codes, AZIMUTHS, twist)[0] for twist in (None, (10.0, 0.0, 0.0)))
+    power = scan_with_spot(-0.1, 30.0)  # seen at the very beginning of the turn
+    still, moving = (detect_points(power, AZIMUTHS, twist)[0] for twist in (None, (10.0, 0.0, 0.0)))
     # The car has another eighth of a second to go, and the echo ahead read 0.49 m too near.
     assert moving[0] - still[0] == pytest.approx(-1.25 + 0.49, abs=0.1)
 
 
 def test_other_bins_are_an_argument() -> None:
-    codes = np.full((400, 576), 6, dtype=np.uint8)
-    codes[100, 115] = 140
-    point = detect_points(codes, AZIMUTHS, range_resolution=0.17361, range_offset=0.0)[0]
+    power = np.full((400, 576), 6, dtype=np.uint8)
+    power[100, 115] = 140
+    point = detect_points(power, AZIMUTHS, calibration=RangeCalibration(0.17361))[0]
     assert np.hypot(*point) == pytest.approx(115.5 * 0.17361)
 
 
@@ -56,88 +57,65 @@ def test_unknown_detectors_are_refused() -> None:
 
 @pytest.mark.parametrize("detector", front_ends.DETECTORS)
 def test_detectors_refuse_scans_that_are_turned_or_no_codes(detector: str) -> None:
-    codes, own = scan_with_spot(0.0, 9.0)[:, :576], {"detector": detector, "range_resolution": 0.17}
+    power, own = (
+        scan_with_spot(0.0, 9.0)[:, :576],
+        {"detector": detector, "calibration": RangeCalibration(0.17)},
+    )
     with pytest.raises(ValueError, match="the power is transposed"):
-        detect_points(codes.T, AZIMUTHS, **own)
+        detect_points(power.T, AZIMUTHS, **own)
     with pytest.raises(ValueError, match="azimuths must decrease"):
-        detect_points(codes, -AZIMUTHS, **own)
+        detect_points(power, -AZIMUTHS, **own)
     with pytest.raises(ValueError, match="power 0..255"):
-        detect_points(codes / 255, AZIMUTHS, **own)
+        detect_points(power / 255, AZIMUTHS, **own)
 
 
 def test_shares_on_a_map_by_hand() -> None:
     pose = np.array([100.0, 50.0, np.pi / 2])  # forward is along y of the map
     points = np.array([[10.0, 0.0], [10.0, 1.5], [20.0, 0.0], [30.0, 0.0]])
     tree = cKDTree([[100.0, 60.0], [100.5, 70.0]])
-    judged = judge_on_map(points, pose, tree)
+    judged = evaluate_on_map(points, pose, tree)
     assert judged == {"n": 4, "share_1m": 0.5, "share_2m": 0.75}
-    nothing = judge_on_map(np.zeros((0, 2)), pose, tree)
+    nothing = evaluate_on_map(np.zeros((0, 2)), pose, tree)
     assert nothing["n"] == 0 and np.isnan(nothing["share_1m"])
 
 
 @pytest.mark.torch
-def test_translated_scan_stands_where_the_scan_shows_it(tmp_path: Path) -> None:
+def test_generated_points_are_where_the_scan_shows_them() -> None:
     torch = pytest.importorskip("torch")
-    from rol.pix2pix import TrainedNetwork, build_generator, load_network, save_weights
+    from rol.pix2pix import Generator, TrainedNetwork
 
-    generator = build_generator(2, 1, rng=torch.Generator().manual_seed(1))
-    generator.image_size = (512, 512)
-    path = tmp_path / "net.safetensors"
-    save_weights(path, generator, {"points": {"threshold": 140}, "pairs_settings": {"motion": "corrected"}})
-    read = load_network(path)
-    assert read.points == {"threshold": 140, "thin": False} and read.settings == {"motion": "corrected"}
-    assert read.about["filters"] == 2
-
-    class Copy(torch.nn.Module):
-        """Gives back what it gets."""
-
-        image_size, size_step, headings = (512, 512), 4, 1
+    class Copy(Generator):
+        """Returns its input."""
 
         def __init__(self) -> None:
-            super().__init__()
+            super().__init__(1, 0)
             self.weight = torch.nn.Parameter(torch.zeros(1))
 
         def logits(self, radar: torch.Tensor) -> torch.Tensor:
             return torch.atanh(radar * 0.999)
 
-    codes, copy = scan_with_spot(0.8, 30.0, 255), TrainedNetwork(Copy(), {"threshold": 60}, {}, {})
-    points, radar_image, fake_image = front_ends.translate_scan(copy, codes, AZIMUTHS)
+    power, copy = scan_with_spot(0.8, 30.0, 255), TrainedNetwork(Copy(), {"threshold": 60}, {}, {})
+    points, radar_image, fake_image = front_ends.generate_points(copy, power, AZIMUTHS)
     assert np.abs(radar_image.astype(int) - fake_image).max() <= 1
-    np.testing.assert_array_equal(front_ends.translate_scan(copy, codes, AZIMUTHS, headings=4)[2], fake_image)
-    raw = detect_points(codes, AZIMUTHS)[0]
+    np.testing.assert_array_equal(
+        front_ends.generate_points(copy, power, AZIMUTHS, tta_rotations=4)[2], fake_image
+    )
+    raw = detect_points(power, AZIMUTHS)[0]
     assert len(points) and np.hypot(*(points.mean(axis=0) - raw)) < 0.3
-    fewer, *_ = front_ends.translate_scan(copy, codes, AZIMUTHS, points={"threshold": int(fake_image.max())})
+    surer = replace(copy, points={"threshold": int(fake_image.max())})
+    fewer, *_ = front_ends.generate_points(surer, power, AZIMUTHS)
     assert 0 < len(fewer) < len(points)
-    near = front_ends.translate_scan(copy, scan_with_spot(0.8, 1.5, 255), AZIMUTHS)[0]
+    near = front_ends.generate_points(copy, scan_with_spot(0.8, 1.5, 255), AZIMUTHS)[0]
     assert len(near) == 0
 
 
-def test_even_out_lets_a_front_count_by_its_length():
+def test_resampling_by_density_lets_a_wall_count_by_its_length():
     rng = np.random.default_rng(3)
     crowd, alone = rng.uniform(0.0, 0.5, (90, 2)), np.arange(10)[:, None] * (5.0, 0.0) + (20.0, 0.0)
     points = np.concatenate([crowd, alone])
-    drawn = even_out(points, 2.0, rng)
+    drawn = resample_by_density(points, 2.0, rng)
     assert drawn.shape == points.shape
     n_crowd = (drawn[:, 0] < 1.0).sum()
     assert abs(n_crowd - 100 / 11) <= 1.0  # the crowd together counts as one of eleven
     assert (drawn[:, None] == points[None]).all(axis=-1).any(axis=1).all()
-    assert even_out(np.zeros((0, 2)), 2.0, rng).shape == (0, 2)
-
-
-@pytest.mark.torch
-@pytest.mark.parametrize(
-    ("header", "fault"),
-    [
-        ({"points": None}, "points is None, not a JSON object"),
-        ({"pairs_settings": [1]}, r"pairs_settings is \[1\], not a JSON object"),
-        ({"points": {"threshold": "high"}}, "points: threshold is 'high', known are"),
-        ({"points": {"radius": 3}}, "points: radius is 3, known are"),
-    ],
-)
-def test_header_with_other_points_is_refused(tmp_path: Path, header: dict, fault: str) -> None:
-    torch = pytest.importorskip("torch")
-    from rol.pix2pix import Pix2PixError, build_generator, load_network, save_weights
-
-    save_weights(tmp_path / "net.safetensors", build_generator(2, 1, rng=torch.Generator()), header)
-    with pytest.raises(Pix2PixError, match=f"net.safetensors: header: {fault}"):
-        load_network(tmp_path / "net.safetensors")
+    assert resample_by_density(np.zeros((0, 2)), 2.0, rng).shape == (0, 2)

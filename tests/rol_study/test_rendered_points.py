@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 
 from rol.geometry import transform_points
 from rol.pix2pix import TrainedNetwork
-from rol_beyond.front_ends import detect_points, judge_on_map
+from rol_beyond.front_ends import detect_points, evaluate_on_map
 from rol_data import rall
 from rol_study import rendered_points
 from rol_study.rendered_points import build_segment, render_points, true_twists
@@ -52,28 +52,28 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
     given: list[Any] = []
 
     def detect(
-        translator: TrainedNetwork, codes: np.ndarray, azimuths: np.ndarray, twist: Any, **how: Any
+        network: TrainedNetwork, power: np.ndarray, azimuths: np.ndarray, twist: Any, **how: Any
     ) -> Any:
-        given.append((translator, twist, how))
-        return detect_points(codes, azimuths, twist), None, None
+        given.append((network, twist, how))
+        return detect_points(power, azimuths, twist), None, None
 
-    monkeypatch.setattr(rendered_points, "translate_scan", detect)
+    monkeypatch.setattr(rendered_points, "generate_points", detect)
     return given
 
 
 def test_clouds_lie_on_the_map_at_their_poses(small_root: Path, asked: list[Any]) -> None:
     tree = cKDTree(rall.load_map_points(small_root / rall.MAP_PATH))
-    clouds = render_points(small_root, "02", 4, 5, NOBODY, 3, bf16=True, headings=2, **QUIET)
+    clouds = render_points(small_root, "02", 4, 5, NOBODY, 3, bf16=True, tta_rotations=2, **QUIET)
     assert isinstance(clouds, Iterator) and not asked  # nothing is rendered before it is asked for
     poses = drive_poses()[4:9]
     right, wrong = ([], [])
     for cloud, pose in zip(clouds, poses, strict=True):
         assert cloud.ndim == 2 and cloud.shape[1] == 2 and len(cloud) > 100
         near = cloud[np.abs(transform_points(pose, cloud)[:, 1] - 14.0) < 4.0]
-        right.append(judge_on_map(near, pose, tree)["share_1m"])
-        wrong.append(judge_on_map(near, pose + (0.0, 3.0, 0.0), tree)["share_1m"])
+        right.append(evaluate_on_map(near, pose, tree)["share_1m"])
+        wrong.append(evaluate_on_map(near, pose + (0.0, 3.0, 0.0), tree)["share_1m"])
     assert np.mean(right) > 0.6 and np.mean(wrong) < 0.5 * np.mean(right)
-    assert all(translator is NOBODY and how == {"bf16": True, "headings": 2} for translator, _, how in asked)
+    assert all(network is NOBODY and how == {"bf16": True, "tta_rotations": 2} for network, _, how in asked)
     speeds = np.array([twist for _, twist, _ in asked])
     np.testing.assert_allclose(speeds[:, 0], 10.0, atol=0.3)
     np.testing.assert_allclose(speeds[:, 2], 0.04, atol=0.01)
@@ -134,7 +134,7 @@ def test_an_untrained_network_on_the_real_route(real_root: Path) -> None:
 
     generator = build_generator(2, 1, rng=torch.Generator().manual_seed(1))
     generator.image_size = (512, 512)
-    translator = TrainedNetwork(generator, {"threshold": 1}, {}, {})
-    clouds = list(render_points(real_root, "02", 6000, 3, translator, 3))
+    network = TrainedNetwork(generator, {"threshold": 1}, {}, {})
+    clouds = list(render_points(real_root, "02", 6000, 3, network, 3))
     assert len(clouds) == 3 and all(len(cloud) > 100 for cloud in clouds)
     assert max(np.abs(cloud).max() for cloud in clouds) < 64.0 * np.sqrt(2.0)

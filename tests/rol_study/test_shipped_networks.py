@@ -14,7 +14,7 @@ pytest.importorskip("torch")
 import train_weights
 from rol.pix2pix import generate, load_metadata, load_weights
 from rol_study import shipped_networks
-from rol_study.shipped_networks import Places, choose_jobs, choose_threshold, load_recipe, make_sessions
+from rol_study.shipped_networks import Places, choose_scans, choose_threshold, load_recipe, make_sessions
 
 pytestmark = [pytest.mark.open3d, pytest.mark.torch]
 RECIPE = """
@@ -118,12 +118,12 @@ def test_places_choose_scans_and_stationary_ones_are_left_out(recipe: Path) -> N
     given = load_recipe(recipe)
     make_sessions(given, {"sim-x"}, Places(recipe, recipe.parent, recipe.parent, threads=1))
     root, part = Path(given["sessions_root"]), {"session": "sim-x"}
-    _, every = choose_jobs(root, part, "corrected")
+    _, every = choose_scans(root, part, "corrected")
     truth = np.loadtxt(root / "sim-x" / "truth.tum")
     place = truth[1, 1:3].tolist()
-    _, near = choose_jobs(root, {**part, "within": [[*place, 1.0]]}, "corrected")
-    _, far = choose_jobs(root, {**part, "without": [[*place, 1.0]]}, "corrected")
-    stamps = [[job["radar_stamp"] for job in jobs] for jobs in (every, near, far)]
+    _, near = choose_scans(root, {**part, "within": [[*place, 1.0]]}, "corrected")
+    _, far = choose_scans(root, {**part, "without": [[*place, 1.0]]}, "corrected")
+    stamps = [[one.radar_stamp_us for one in aligned] for aligned in (every, near, far)]
     assert sorted(stamps[1] + stamps[2]) == stamps[0] and 0 < len(near) < len(every)
 
 

@@ -181,7 +181,7 @@ def packages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A folder with two packages, one of which imports the other, that stands for ``src``; and a lock file."""
     files = {
         "rol/__init__.py": '"""Package."""\n\n__version__ = "1"\n',
-        "rol/geometry.py": "import numpy\n",
+        "rol/geometry.py": "import numpy\n\ncompose = numpy.add\n",
         "rol/mcl.py": 'def f():\n    """Doc."""\n    from .geometry import compose\n',
         "rol/plots.py": "",
         "simulator/__init__.py": "",
@@ -215,9 +215,16 @@ def test_imports_are_followed_through_all_packages(packages: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "line", ["import rol_gone.mcl", "from rol.gone import f", "from rol import gone", "import rolled"]
+    "line",
+    [
+        "import rol_gone.mcl",
+        "from rol.gone import f",
+        "from rol import gone",
+        "from rol.mcl import gone",
+        "import rolled",
+    ],
 )
-def test_import_that_leads_to_no_file_is_refused(packages: Path, tmp_path: Path, line: str) -> None:
+def test_import_that_leads_to_nothing_is_refused(packages: Path, tmp_path: Path, line: str) -> None:
     gone = line.removeprefix("import ").replace("from ", "").replace(" import ", ".")
     with pytest.raises(ChapterError, match=f"n.ipynb: imports `{gone}`"):
         chapters.chapter_digest(write_notebook(tmp_path / "n.ipynb", new_code_cell(line)))
@@ -236,6 +243,15 @@ def test_every_folder_of_code_is_a_package_that_digests_follow() -> None:
     folders = {file.parent for file in chapters.SOURCE.rglob("[!.]*.py")}
     assert all((folder / "__init__.py").is_file() for folder in folders)
     assert all(folder.relative_to(chapters.SOURCE).parts[0].startswith("rol") for folder in folders)
+
+
+def test_every_import_of_packages_and_scripts_leads_to_a_name() -> None:
+    files = sorted(chapters.SOURCE.rglob("[!.]*.py"))
+    modules = [".".join(file.relative_to(chapters.SOURCE).with_suffix("").parts) for file in files]
+    lines = [f"import {module.removesuffix('.__init__')}" for module in modules]
+    assert chapters.module_files(lines, "all modules") == files
+    for script in (ROOT / "workflow").glob("[!.]*.py"):
+        chapters.module_files([script.read_text(encoding="utf-8")], str(script))
 
 
 @pytest.mark.parametrize(

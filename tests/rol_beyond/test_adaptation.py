@@ -1,18 +1,22 @@
-"""A few real pairs teach a network about their radar, and leave it what it knew beyond the lidar's reach."""
+"""Adaptation: the target image, fine-tuning on a few real pairs, and refused input."""
 
 import copy
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 torch = pytest.importorskip("torch")
 
+from rol.pairs import PairSettings
 from rol.pix2pix import build_generator, generate
-from rol_beyond.adapt import RealPair, adapt, draw_real_pair
+from rol_beyond import unet  # noqa: F401 (registers its architecture)
+from rol_beyond.adaptation import AdaptationConfig, RealPair, adapt, draw_real_pair
 
 pytestmark = pytest.mark.torch
 AZIMUTHS = -2.0 * np.pi * np.arange(400) / 400
-SETTINGS = {"width": 64, "pixel_size": 1.0, "range_resolution": 0.1, "range_offset": 0.0}
+NEAR = AdaptationConfig(reach_m=15.0, threshold=100)
+SETTINGS = PairSettings(width=64, pixel_size=1.0, range_resolution=0.1, range_offset=0.0)
 
 
 def make_pair(seed: int) -> RealPair:
@@ -38,52 +42,51 @@ def generator() -> torch.nn.Module:
     return network
 
 
-def test_target_is_the_lidar_near_by_and_the_old_drawing_beyond(generator: torch.nn.Module) -> None:
+def test_target_is_the_lidar_within_its_reach_and_the_previous_output_beyond(
+    generator: torch.nn.Module,
+) -> None:
     pair = make_pair(0)
-    radar, lidar = draw_real_pair(generator, pair, 0.0, reach_m=15.0, threshold=100, settings=SETTINGS)
+    radar, lidar = draw_real_pair(generator, pair, 0.0, NEAR, SETTINGS)
     axis = 31.5 - np.arange(64)
     ranges = np.hypot(axis[:, None], axis[None, :])
-    drawn = np.where(generate(generator, radar, headings=1) >= 100, 255, 0)
+    drawn = np.where(generate(generator, radar, tta_rotations=1) >= 100, 255, 0)
     np.testing.assert_array_equal(lidar[ranges >= 15.0], drawn[ranges >= 15.0])
     rows, columns = np.nonzero((lidar > 0) & (ranges < 15.0))
     assert len(rows) > 10 and (np.abs(axis[columns] - 10.0) <= 0.5).all()  # y is to the left
-    turned = draw_real_pair(generator, pair, np.pi / 2, reach_m=15.0, threshold=100, settings=SETTINGS)[1]
+    turned = draw_real_pair(generator, pair, np.pi / 2, NEAR, SETTINGS)[1]
     rows, columns = np.nonzero((turned > 0) & (ranges < 15.0))
     assert (np.abs(axis[rows] + 10.0) <= 0.5).all()  # a quarter turn to the left brings it behind
 
 
 def test_adapting_draws_the_wall_and_leaves_the_first_network_alone(generator: torch.nn.Module) -> None:
     pairs, before = [make_pair(seed) for seed in range(3)], copy.deepcopy(generator.state_dict())
-    options = {"reach_m": 25.0, "steps": 40, "batch": 2, "learning_rate": 5e-3, "settings": SETTINGS}
-    adapted = adapt(generator, pairs, np.random.default_rng(1), **options)
+    config = AdaptationConfig(25.0, steps=40, batch_size=2, learning_rate=5e-3)
+    adapted = adapt(generator, pairs, np.random.default_rng(1), config, SETTINGS)
     assert all(torch.equal(value, before[name]) for name, value in generator.state_dict().items())
-    radar, lidar = draw_real_pair(
-        generator, make_pair(9), 1.0, reach_m=25.0, threshold=150, settings=SETTINGS
-    )
+    radar, lidar = draw_real_pair(generator, make_pair(9), 1.0, config, SETTINGS)
     contrast = [
         generate(network, radar)[lidar > 0].mean() - generate(network, radar)[lidar == 0].mean()
         for network in (generator, adapted)
     ]
     assert contrast[1] > contrast[0] + 30
-    again = adapt(generator, pairs, np.random.default_rng(1), **options)
+    again = adapt(generator, pairs, np.random.default_rng(1), config, SETTINGS)
     np.testing.assert_array_equal(generate(again, radar), generate(adapted, radar))
 
 
 def test_adapting_in_bf16_rounds_a_little(generator: torch.nn.Module) -> None:
-    options = {"reach_m": 25.0, "steps": 1, "batch": 2, "settings": SETTINGS}
-    pairs = [make_pair(seed) for seed in range(2)]
-    plain, rounded = (
+    pairs, plain = [make_pair(seed) for seed in range(2)], AdaptationConfig(25.0, steps=1, batch_size=2)
+    exact, rounded = (
         torch.cat(
-            [
-                w.flatten()
-                for w in adapt(generator, pairs, np.random.default_rng(1), bf16=bf16, **options).parameters()
-            ]
+            [weight.flatten() for weight in adapt(generator, pairs, rng, config, SETTINGS).parameters()]
         )
-        for bf16 in (False, True)
+        for config, rng in (
+            (plain, np.random.default_rng(1)),
+            (replace(plain, bf16=True), np.random.default_rng(1)),
+        )
     )
-    assert 0.0 < (plain - rounded).abs().max() < 1e-3
+    assert 0.0 < (exact - rounded).abs().max() < 1e-3
 
 
-def test_nothing_to_learn_from_is_refused(generator: torch.nn.Module) -> None:
+def test_no_pairs_are_refused(generator: torch.nn.Module) -> None:
     with pytest.raises(ValueError, match="no real pairs"):
-        adapt(generator, [], np.random.default_rng(1), reach_m=20.0)
+        adapt(generator, [], np.random.default_rng(1), NEAR)

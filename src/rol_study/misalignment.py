@@ -1,146 +1,13 @@
-"""The alignment room: which sweeps go with which scan, and how far the two images of a pair are apart.
+"""Measure how far the radar image and the lidar image of a pair are shifted against each other.
 
-Both images have the sensor in the middle, row 0 farthest forward, column 0 farthest left. A shift tells where
-the radar shows what the lidar shows: positive rows lie behind, positive columns to the right, positive ranges
-farther out.
+Both images have the sensor in the middle, row 0 farthest forward, column 0 farthest left. A shift is where the radar
+shows what the lidar shows: positive rows lie behind, positive columns to the right, positive ranges farther out.
 """
 
 from __future__ import annotations
 
-from typing import Any
-
 import cv2
 import numpy as np
-
-
-def usable_stamps(session: Any, sensor: str) -> np.ndarray:
-    """List the frames of a sensor that can be read: listed, not flagged 0, and with a file.
-
-    Parameters
-    ----------
-    session : rol.oxford.Session
-        The session.
-    sensor : str
-        "radar", "velodyne_left" or "velodyne_right".
-
-    Returns
-    -------
-    stamps_us : array, shape (n,), int64
-        Their stamps [us].
-
-    Raises
-    ------
-    ValueError
-        If there is no such frame; the message names the folder.
-    """
-    listed = {
-        "radar": session.radar_stamps_us,
-        "velodyne_left": session.left_stamps_us,
-        "velodyne_right": session.right_stamps_us,
-    }[sensor]
-    folder = session.root / sensor
-    there = {p.stem for p in folder.iterdir() if p.suffix in (".png", ".bin")} if folder.is_dir() else set()
-    kept = [stamp for stamp in (() if listed is None else listed.tolist()) if str(stamp) in there]
-    if not kept:
-        raise ValueError(f"{folder}: no usable frame of {sensor}; a pair needs the radar and a lidar")
-    return np.array(kept, dtype=np.int64)
-
-
-def usable_sweeps(session: Any) -> dict[str, np.ndarray]:
-    """List the usable sweeps of the lidars that a session has.
-
-    Parameters
-    ----------
-    session : rol.oxford.Session
-        The session.
-
-    Returns
-    -------
-    sweeps_us : dict of array, int64
-        "left", "right" or both -> stamps of the sweeps [us], as of `usable_stamps`.
-
-    Raises
-    ------
-    ValueError
-        If neither lidar has a usable sweep; the message names the folders.
-    """
-    found, faults = {}, []
-    for side in ("left", "right"):
-        try:
-            found[side] = usable_stamps(session, f"velodyne_{side}")
-        except ValueError as error:
-            faults.append(str(error))
-    if not found:
-        raise ValueError("; ".join(faults))
-    return found
-
-
-def align_scans(
-    radar_us: np.ndarray,
-    mid_us: np.ndarray,
-    twists: np.ndarray,
-    sweeps_us: dict[str, np.ndarray],
-    *,
-    motion: str = "none",
-    max_gap_us: int = 50_000,
-) -> dict[str, np.ndarray]:
-    """Find the sweeps of every scan; scans that lack the sweep of a lidar are left out.
-
-    Parameters
-    ----------
-    radar_us, mid_us : array, shape (n,)
-        Stamps of the scans and their times at mid-scan [us].
-    twists : array, shape (n, 3)
-        Body velocities [m/s, m/s, rad/s].
-    sweeps_us : dict of array
-        Stamps of the sweeps [us] by lidar, "left", "right" or both, as from `usable_sweeps`.
-    motion : str
-        "none" takes the sweeps nearest to the scan's stamp, "corrected" those nearest to mid-scan.
-    max_gap_us : int
-        Largest gap allowed [us].
-
-    Returns
-    -------
-    columns : dict of arrays, shape (p,)
-        The columns of ``alignment.csv``; stamps [us], gaps (sweep minus scan) [ms], velocities [m/s, rad/s].
-        A lidar that the session does not have has no columns.
-
-    Raises
-    ------
-    ValueError
-        If no lidar or an unknown one is given, or no scan has its sweeps within `max_gap_us`; the message gives
-        the smallest gap of each lidar.
-
-    Notes
-    -----
-    Yin et al. 2020, Sec. III-A, is "none".
-    """
-    from .pairs import associate_nearest
-
-    if motion not in ("none", "corrected"):
-        raise ValueError(f"motion must be 'none' or 'corrected', not {motion!r}")
-    if not sweeps_us or not sweeps_us.keys() <= {"left", "right"}:
-        raise ValueError(f"sweeps_us must have the keys 'left', 'right' or both, not {list(sweeps_us)}")
-    reference = radar_us if motion == "none" else mid_us
-    matches = {side: associate_nearest(reference, us, max_gap_us) for side, us in sweeps_us.items()}
-    kept = np.all([index >= 0 for index, _ in matches.values()], axis=0)
-    if not kept.any():
-        least = ", ".join(
-            f"{side} {(np.abs(gap) / 1e3).min(initial=np.inf):g} ms" for side, (_, gap) in matches.items()
-        )
-        place = "its stamp" if motion == "none" else "mid-scan"
-        raise ValueError(
-            f"motion {motion!r}: no scan has its sweeps within {max_gap_us / 1000:g} ms of {place};"
-            f" the smallest gaps are {least}"
-        )
-    columns = {"radar_stamp_us": radar_us[kept], "mid_stamp_us": mid_us[kept]}
-    for side, (index, _) in matches.items():
-        columns[f"{side}_stamp_us"] = sweeps_us[side][index[kept]]
-    for side, (_, gap_us) in matches.items():
-        columns[f"{side}_gap_ms"] = gap_us[kept] / 1000.0
-    for i, name in enumerate(("vx_mps", "vy_mps", "yaw_rate_radps")):
-        columns[name] = twists[kept, i]
-    return columns
 
 
 def measure_misalignment(
@@ -177,8 +44,8 @@ def correlate_images(
 ) -> np.ndarray:
     """Correlate two images over all small shifts.
 
-    The radar's slow brightness is taken off and the lidar's pixels are blurred a little, so that edges
-    decide.
+    The local mean of the radar is subtracted and the lidar's pixels are blurred slightly, so that edges
+    dominate.
 
     Parameters
     ----------
@@ -254,7 +121,7 @@ def correlate_ranges(
 
 
 def best_shifts(shifts: np.ndarray, table: np.ndarray) -> np.ndarray:
-    """Read the best shift off every row of a correlation table.
+    """Find the best shift of every row of a correlation table.
 
     Parameters
     ----------
@@ -278,14 +145,14 @@ def best_shifts(shifts: np.ndarray, table: np.ndarray) -> np.ndarray:
 
 
 def _vertex(three: np.ndarray) -> float:
-    """Place of a parabola's vertex through values at -1, 0, 1."""
+    """Compute the vertex of the parabola through values at -1, 0, 1."""
     left, middle, right = (float(v) for v in three)
     bend = left - 2.0 * middle + right
     return 0.5 * (left - right) / bend if bend < 0.0 else 0.0
 
 
 def _sharpen(radar_image: np.ndarray, blind_px: float) -> np.ndarray:
-    """Take the mean of 8 m around off each pixel, so that streaks and fall-off do not count."""
+    """Subtract the mean of 8 m around each pixel, so that streaks and fall-off do not count."""
     image = np.asarray(radar_image, dtype=np.float32)
     return _ring(image - cv2.blur(image, (33, 33), borderType=cv2.BORDER_REFLECT), blind_px)
 

@@ -1,87 +1,10 @@
-"""Alignment: sweeps are found for scans, and known shifts of images to a fraction of a pixel."""
+"""Misalignment of pairs: known shifts of images are found to a fraction of a pixel."""
 
 import cv2
 import numpy as np
 import pytest
 
-from rol.alignment import (
-    align_scans,
-    best_shifts,
-    correlate_images,
-    correlate_ranges,
-    measure_misalignment,
-    usable_stamps,
-    usable_sweeps,
-)
-from rol.oxford import Session
-from rol.pairs import job_of_row
-
-
-def test_align_scans_by_hand():
-    radar = np.array([0, 250_000, 500_000])
-    twists = np.array([[1.0, 0.1, 0.01], [2.0, 0.2, 0.02], [3.0, 0.3, 0.03]])
-    sweeps = {
-        "left": np.array([10_000, 130_000, 260_000, 380_000]),
-        "right": np.array([-40_000, 120_000, 265_000, 375_000]),
-    }
-    columns = align_scans(radar, radar + 125_000, twists, sweeps)
-    np.testing.assert_array_equal(columns["radar_stamp_us"], [0, 250_000])  # nothing within 50 ms of the last
-    np.testing.assert_array_equal(columns["left_stamp_us"], [10_000, 260_000])
-    np.testing.assert_array_equal(columns["right_gap_ms"], [-40.0, 15.0])
-    columns = align_scans(radar, radar + 125_000, twists, sweeps, motion="corrected")
-    np.testing.assert_array_equal(columns["left_gap_ms"], [5.0, 5.0])
-    np.testing.assert_array_equal(columns["right_stamp_us"], [120_000, 375_000])
-    row = {name: values[1] for name, values in columns.items()}
-    assert job_of_row(row) == {
-        "radar_stamp": 250_000,
-        "left_stamp": 380_000,
-        "right_stamp": 375_000,
-        "mid_stamp_us": 375_000,
-        "twist": (2.0, 0.2, 0.02),
-    }
-    with pytest.raises(ValueError, match="motion must be"):
-        align_scans(radar, radar, twists, sweeps, motion="maybe")
-
-
-@pytest.mark.parametrize("side", ["left", "right"])
-def test_one_lidar_is_enough(side):
-    radar, twists, sweeps = np.array([0, 250_000]), np.zeros((2, 3)), {side: np.array([10_000, 260_000])}
-    columns = align_scans(radar, radar + 125_000, twists, sweeps)
-    assert [name for name in columns if "left" in name or "right" in name] == [
-        f"{side}_stamp_us",
-        f"{side}_gap_ms",
-    ]
-    job = job_of_row({name: values[1] for name, values in columns.items()})
-    assert {job["left_stamp"], job["right_stamp"]} == {260_000, None} and job[f"{side}_stamp"] == 260_000
-    for wrong in ({}, {f"velodyne_{side}": radar}):
-        with pytest.raises(ValueError, match="sweeps_us must have the keys"):
-            align_scans(radar, radar, twists, wrong)
-
-
-def test_scans_that_are_all_too_far_from_their_sweeps_are_refused():
-    radar, twists = np.array([0, 250_000]), np.zeros((2, 3))
-    sweeps = {"left": radar + 90_000, "right": radar + 10_000}
-    with pytest.raises(
-        ValueError, match="within 50 ms of its stamp; the smallest gaps are left 90 ms, right 10 ms"
-    ):
-        align_scans(radar, radar + 125_000, twists, sweeps)
-    sweeps = {"left": radar + 90_000}
-    assert len(align_scans(radar, radar + 125_000, twists, sweeps, motion="corrected")["left_gap_ms"]) == 2
-
-
-def test_usable_stamps(tmp_path):
-    (tmp_path / "velodyne_left").mkdir()
-    for name in ("10.png", "20.bin", "40.png", "notes.txt"):
-        (tmp_path / "velodyne_left" / name).touch()
-    session = Session(tmp_path, "s", np.array([1]), np.array([10, 20, 30]), None)
-    np.testing.assert_array_equal(usable_stamps(session, "velodyne_left"), [10, 20])
-    with pytest.raises(ValueError, match="velodyne_right: no usable frame"):
-        usable_stamps(session, "velodyne_right")
-    with pytest.raises(ValueError, match="radar: no usable frame"):
-        usable_stamps(session, "radar")
-    assert list(usable_sweeps(session)) == ["left"]
-    with pytest.raises(ValueError, match="velodyne_left: no usable frame.*velodyne_right: no usable frame"):
-        usable_sweeps(Session(tmp_path, "s", np.array([1]), None, np.array([10])))
+from rol_study.misalignment import best_shifts, correlate_images, correlate_ranges, measure_misalignment
 
 
 def street(seed=0, width=512):

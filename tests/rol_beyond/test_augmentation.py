@@ -1,5 +1,6 @@
-"""Pairs in any heading: a turned pair shows the turned world, and the clouds on disk are those asked for."""
+"""Augmentation: a rotated pair shows the rotated surroundings, gain, streaks and ghosts, joined sets."""
 
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -8,12 +9,13 @@ import pytest
 
 from rol.bev import image_to_points
 from rol.oxford import RadarScan
-from rol_beyond import scan_pairs
-from rol_beyond.scan_pairs import JoinedPairs, LidarClouds, ScanPairs, turned_radar_image
+from rol.pairs import AlignedScan, PairSettings
+from rol_beyond import augmentation
+from rol_beyond.augmentation import JoinedPairs, LidarClouds, ScanPairs, rotated_radar_image
 from rol_sim.session.oxford_files import save_radar
 
 AZIMUTHS = -2.0 * np.pi * (13 + 14 * np.arange(400)) / 5600
-SETTINGS = {"width": 256, "pixel_size": 0.5, "max_range": 60.0, "motion": "corrected"}
+SETTINGS = PairSettings("corrected", max_range=60.0, width=256, pixel_size=0.5)
 
 
 def bright_spot(bearing: float, range_m: float) -> np.ndarray:
@@ -38,49 +40,49 @@ def middle_of(image: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("twist", [(0.0, 0.0, 0.0), (12.0, 0.3, 0.2)])
 def test_a_turned_scan_is_the_scan_of_a_turned_world(turn: float, twist: tuple) -> None:
     codes = bright_spot(-1.2, 35.0)
-    plain = middle_of(turned_radar_image(codes, AZIMUTHS, 0.0, twist, SETTINGS))
-    turned = middle_of(turned_radar_image(codes, AZIMUTHS, turn, twist, SETTINGS))
+    plain = middle_of(rotated_radar_image(codes, AZIMUTHS, 0.0, twist, SETTINGS))
+    turned = middle_of(rotated_radar_image(codes, AZIMUTHS, turn, twist, SETTINGS))
     c, s = np.cos(turn), np.sin(turn)
     np.testing.assert_allclose(turned, np.array([[c, -s], [s, c]]) @ plain, atol=0.12)
 
 
 def test_without_motion_turning_by_rows_moves_rows() -> None:
     codes = np.random.default_rng(0).integers(0, 120, (400, 3768)).astype(np.uint8)
-    plain = {**SETTINGS, "motion": "none"}
-    turned = turned_radar_image(codes, AZIMUTHS, -2.0 * np.pi * 100 / 400, (0, 0, 0), plain)
-    rolled = turned_radar_image(np.roll(codes, 100, axis=0), AZIMUTHS, 0.0, (0, 0, 0), plain)
+    plain = replace(SETTINGS, motion="none")
+    turned = rotated_radar_image(codes, AZIMUTHS, -2.0 * np.pi * 100 / 400, (0, 0, 0), plain)
+    rolled = rotated_radar_image(np.roll(codes, 100, axis=0), AZIMUTHS, 0.0, (0, 0, 0), plain)
     assert np.abs(turned.astype(int) - rolled).max() <= 1
 
 
 def test_gain_moves_codes_and_leaves_silence() -> None:
     codes = np.array([[0, 6, 120, 254]], dtype=np.uint8)
-    np.testing.assert_array_equal(scan_pairs.shift_codes(codes, 2.0), [[0, 10, 124, 255]])
-    np.testing.assert_array_equal(scan_pairs.shift_codes(codes, -4.0), [[0, 1, 112, 246]])
-    assert scan_pairs.shift_codes(codes, 0.0) is codes
+    np.testing.assert_array_equal(augmentation.apply_gain(codes, 2.0), [[0, 10, 124, 255]])
+    np.testing.assert_array_equal(augmentation.apply_gain(codes, -4.0), [[0, 1, 112, 246]])
+    assert augmentation.apply_gain(codes, 0.0) is codes
 
 
 def test_streaks_brighten_a_few_rows_and_darken_nothing() -> None:
     codes = bright_spot(-1.2, 35.0)
-    dazzled = scan_pairs.add_streaks(codes, 2, np.random.default_rng(1))
+    dazzled = augmentation.add_streaks(codes, 2, np.random.default_rng(1))
     assert (dazzled >= codes).all() and codes[0, 0] == 6
     changed = np.flatnonzero((dazzled != codes).mean(axis=1) > 0.2)
     assert 2 <= len(changed) <= 14  # of 400
     near, far = (np.median(dazzled[changed][:, part]) for part in (slice(700, 900), slice(3000, 3700)))
     assert near > far + 10
-    np.testing.assert_array_equal(dazzled, scan_pairs.add_streaks(codes, 2, np.random.default_rng(1)))
-    np.testing.assert_array_equal(scan_pairs.add_streaks(codes, 0, np.random.default_rng(1)), codes)
+    np.testing.assert_array_equal(dazzled, augmentation.add_streaks(codes, 2, np.random.default_rng(1)))
+    np.testing.assert_array_equal(augmentation.add_streaks(codes, 0, np.random.default_rng(1)), codes)
 
 
 def test_ghosts_are_echoes_elsewhere() -> None:
     codes = bright_spot(-1.2, 35.0)
-    haunted = scan_pairs.add_ghosts(codes, 5, np.random.default_rng(1))
+    haunted = augmentation.add_ghosts(codes, 5, np.random.default_rng(1))
     assert (haunted >= codes).all() and (codes > 6).sum() == 51
     changed = np.argwhere(haunted != codes)
     assert 5 < len(changed) <= 5 * 51 and changed[:, 1].max() < 1600
     assert haunted[tuple(changed.T)].max() <= 200 and haunted[tuple(changed.T)].max() > 100
-    np.testing.assert_array_equal(haunted, scan_pairs.add_ghosts(codes, 5, np.random.default_rng(1)))
+    np.testing.assert_array_equal(haunted, augmentation.add_ghosts(codes, 5, np.random.default_rng(1)))
     quiet = np.full((400, 3768), 6, dtype=np.uint8)  # nothing bright, no ghosts
-    np.testing.assert_array_equal(scan_pairs.add_ghosts(quiet, 5, np.random.default_rng(1)), quiet)
+    np.testing.assert_array_equal(augmentation.add_ghosts(quiet, 5, np.random.default_rng(1)), quiet)
 
 
 def make_pairs(tmp_path: Path) -> ScanPairs:
@@ -92,11 +94,10 @@ def make_pairs(tmp_path: Path) -> ScanPairs:
         ),
     )  # fmt: skip
     session = SimpleNamespace(name="sim-x", radar_path=lambda us: tmp_path / f"{us}.png")
-    jobs = [
-        {"radar_stamp": 1000, "left_stamp": 1, "right_stamp": 2, "mid_stamp_us": 3, "twist": (5.0, 0.0, 0.1)}
-    ]
-    points = np.rint(np.array([[10.0, 2.0], [-20.0, 31.0], [3.0, -8.0]]) / scan_pairs.STEP_M).astype(np.int16)
-    return ScanPairs(session, jobs, LidarClouds(points, np.array([0, 3])), SETTINGS)
+    aligned = [AlignedScan(1000, 1, 2, 3, (5.0, 0.0, 0.1))]
+    points = np.array([[10.0, 2.0], [-20.0, 31.0], [3.0, -8.0]])
+    points = np.rint(points / augmentation.STEP_M).astype(np.int16)
+    return ScanPairs(session, aligned, LidarClouds(points, np.array([0, 3])), SETTINGS)
 
 
 def test_both_sides_of_a_pair_turn_together(tmp_path: Path) -> None:
@@ -113,7 +114,7 @@ def test_both_sides_of_a_pair_turn_together(tmp_path: Path) -> None:
     dazzled = pairs.draw(0, 0.0, 0.0, 3, 2, np.random.default_rng(2))
     assert (dazzled[0] > pairs[0][0]).sum() > 100  # the radar alone
     np.testing.assert_array_equal(dazzled[1], pairs[0][1])
-    with pytest.raises(ValueError, match="need a generator"):
+    with pytest.raises(ValueError, match="need a random generator"):
         pairs.draw(0, 0.0, 0.0, 1)
 
 
@@ -125,4 +126,6 @@ def test_joined_sets_count_on(tmp_path: Path) -> None:
     with pytest.raises(IndexError, match="pair 3 of 3"):
         joined[3]
     with pytest.raises(ValueError, match="1 scans, but clouds of 2"):
-        ScanPairs(pairs.session, pairs.jobs, LidarClouds(pairs.clouds.points, np.array([0, 1, 3])), SETTINGS)
+        ScanPairs(
+            pairs.session, pairs.aligned, LidarClouds(pairs.clouds.points, np.array([0, 1, 3])), SETTINGS
+        )
