@@ -35,11 +35,7 @@ PACKAGES = {
 }  # fmt: skip
 
 # Modules that may import torch; no module of `rol` may import open3d or matplotlib.
-<<<<<<< HEAD
-WITH_TORCH = {"pix2pix", "training"}
-=======
-WITH_TORCH = {"fakes", "pipeline", "pix2pix", "training"}
->>>>>>> filter
+WITH_TORCH = {"pipeline", "pix2pix", "training"}
 END = "----- end of an example -----\n"
 
 
