@@ -28,9 +28,11 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 try:
+    from .bev import normalize_image
     from .files import write_bytes
     from .geometry import check_fields
 except ImportError:  # this file was copied on its own
+    from bev import normalize_image
     from files import write_bytes
     from geometry import check_fields
 
@@ -461,7 +463,7 @@ def to_tensor(image: np.ndarray) -> Tensor:
     tensor : tensor, shape (1, 1, h, w), float32
         The same in [-1, 1].
     """
-    return torch.from_numpy(image[None, None].astype(np.float32) / np.float32(127.5) - np.float32(1.0))
+    return torch.from_numpy(normalize_image(image[None, None]))
 
 
 def generate(

@@ -9,6 +9,11 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial import cKDTree
 
+try:
+    from .geometry import check_points
+except ImportError:  # this file was copied on its own
+    from geometry import check_points
+
 
 def nn_distances(points: np.ndarray, reference: np.ndarray) -> np.ndarray:
     """Compute the distance of each point to the nearest reference point.
@@ -34,7 +39,7 @@ def nn_distances(points: np.ndarray, reference: np.ndarray) -> np.ndarray:
     -----
     Yin et al. 2020, Sec. IV-B: generated points against the k-d tree of the lidar points.
     """
-    points, reference = _check_cloud(points, "points"), _check_cloud(reference, "reference")
+    points, reference = check_points(points), check_points(reference, "reference")
     if len(reference) == 0 or len(points) == 0:
         return np.full(len(points), np.inf)
     return cKDTree(reference).query(points)[0]
@@ -129,15 +134,3 @@ def summarize_distances(fake_to_real: np.ndarray, real_to_fake: np.ndarray) -> d
         summary[f"{name}_within_2m"] = fraction_within(distances, 2.0)
         summary[f"{name}_median_m"] = float(np.median(distances)) if len(distances) else float("nan")
     return summary
-
-
-def _check_cloud(points: np.ndarray, name: str) -> np.ndarray:
-    """Refuse clouds of another shape or with non-finite values."""
-    points = np.asarray(points, dtype=np.float64)
-    if points.size == 0:
-        return points.reshape(0, 2)
-    if points.ndim != 2 or points.shape[1] != 2:
-        raise ValueError(f"{name}: expected shape (n, 2), got {points.shape}")
-    if not np.isfinite(points).all():
-        raise ValueError(f"{name}: point {int(np.argmin(np.isfinite(points).all(axis=1)))} is not finite")
-    return points

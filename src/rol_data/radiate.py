@@ -117,7 +117,7 @@ def _load_power(path: Path) -> np.ndarray:
     image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
     if image is None or image.shape != (N_BINS, N_AZIMUTHS) or image.dtype != np.uint8:
         shape = None if image is None else image.shape
-        raise RadiateError(f"{path}: expected a grey picture of {N_BINS} x {N_AZIMUTHS}, got {shape}")
+        raise RadiateError(f"{path}: expected a grey image of {N_BINS} x {N_AZIMUTHS}, got {shape}")
     return np.ascontiguousarray(image.T)
 
 

@@ -113,7 +113,7 @@ def load_map_points(path: Path | str, shape: tuple[int, int] | None = None) -> n
     path = Path(path)
     image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED) if path.is_file() else None
     if image is None:
-        raise RallError(f"{path}: missing or not a picture")
+        raise RallError(f"{path}: missing or not an image")
     if image.ndim != 2:
         raise RallError(f"{path}: expected one grey channel, got shape {image.shape}")
     if shape is not None and image.shape != shape:

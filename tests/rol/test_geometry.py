@@ -48,7 +48,7 @@ def test_relative_pose():
     assert_allclose(geometry.relative_pose([5, 5, QUARTER], [6, 7, QUARTER]), [2, -1, 0], atol=1e-12)
 
 
-def test_accumulate_steps_around_a_square():
+def test_accumulate_increments_around_a_square():
     steps = [[2, 0, QUARTER]] * 4
     expected = [[0, 0, 0], [2, 0, QUARTER], [2, 2, -np.pi], [0, 2, -QUARTER], [0, 0, 0]]
     poses = geometry.accumulate_increments(steps)
@@ -56,7 +56,7 @@ def test_accumulate_steps_around_a_square():
     assert_allclose(np.abs(geometry.wrap_angle(poses[:, 2] - np.array(expected)[:, 2])), 0, atol=1e-12)
 
 
-def test_accumulate_steps_agrees_with_compose_from_any_start():
+def test_accumulate_increments_agrees_with_compose_from_any_start():
     steps = np.random.default_rng(3).normal(size=(20, 3))
     pose = np.array([3.0, -1.0, 2.0])
     poses = geometry.accumulate_increments(steps, pose)

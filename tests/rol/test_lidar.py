@@ -46,7 +46,7 @@ def test_crop_range_is_measured_in_the_plane():
     np.testing.assert_array_equal(crop_range(points[:, :2], 5.0), points[[0, 2], :2])
 
 
-def test_threshold_losses_by_hand():
+def test_ground_removal_tradeoff_by_hand():
     heights = np.array([-2.0, -1.9, -1.8, -1.4, -1.9, -1.0, 0.0, 1.0, 2.0])
     is_ground = np.array([1, 1, 1, 1, 0, 0, 0, 0, 0], dtype=bool)
     ground, objects = ground_removal_tradeoff(heights, is_ground, np.array([-3.0, -1.8, -1.5, 3.0]))

@@ -38,14 +38,14 @@ def make_raw(n=24, stamp_us=START):
     )
 
 
-def make_odometry(stamps_us, steps=None):
+def make_odometry(stamps_us, increments=None):
     """One row per pair of neighbouring stamps; mid-scan 125 ms after the first row."""
     stamps_us = np.asarray(stamps_us)
     n = len(stamps_us) - 1
-    steps_6dof = np.zeros((n, 6))
-    steps_6dof[:, [0, 1, 5]] = [1.0, 0.0, 0.0] if steps is None else steps
+    increments_6dof = np.zeros((n, 6))
+    increments_6dof[:, [0, 1, 5]] = [1.0, 0.0, 0.0] if increments is None else increments
     mid = stamps_us + 125_000
-    return oxford.RadarOdometry(mid[1:], mid[:-1], stamps_us[1:], stamps_us[:-1], steps_6dof)
+    return oxford.RadarOdometry(mid[1:], mid[:-1], stamps_us[1:], stamps_us[:-1], increments_6dof)
 
 
 GPS_TEXT = (

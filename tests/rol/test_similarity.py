@@ -62,5 +62,5 @@ def test_refuses_nan_and_wrong_shapes():
         nn_distances(np.array([[np.nan, 0.0]]), REAL)
     with pytest.raises(ValueError, match="reference: point 1 is not finite"):
         nn_distances(FAKE, np.array([[0.0, 0.0], [np.inf, 0.0]]))
-    with pytest.raises(ValueError, match="expected shape"):
+    with pytest.raises(ValueError, match="expected points of shape"):
         nn_distances(np.zeros((3, 3)), REAL)

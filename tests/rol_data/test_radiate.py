@@ -47,7 +47,7 @@ def test_axes_and_times_of_a_pair(tmp_path: Path) -> None:
         ("Navtech_Polar.txt", b"Frame: 000002 Time: 1.0", "000001.png: has no time"),
         ("velo_lidar/000008.csv", b"1,2,3", "000008.csv: expected rows of five"),
         ("velo_lidar/000008.csv", b"a,b,c,d,e", "000008.csv: not a table"),
-        ("Navtech_Polar/000001.png", b"", "000001.png: expected a grey picture of 576 x 400, got None"),
+        ("Navtech_Polar/000001.png", b"", "000001.png: expected a grey image of 576 x 400, got None"),
         (
             "../../../config/default-calib.yaml",
             b"lidar_calib: {}",

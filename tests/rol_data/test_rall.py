@@ -138,7 +138,7 @@ def test_faulty_poses_are_named(tmp_path: Path, content: str | None, fault: str)
 
 def test_faulty_maps_and_scan_poses_are_named(tmp_path: Path) -> None:
     path = tmp_path / "map.png"
-    with pytest.raises(rall.RallError, match=r"map.png: missing or not a picture"):
+    with pytest.raises(rall.RallError, match=r"map.png: missing or not an image"):
         rall.load_map_points(path)
     cv2.imwrite(str(path), np.zeros((4, 4), dtype=np.uint8))
     with pytest.raises(rall.RallError, match="holds no occupied cell"):
