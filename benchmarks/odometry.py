@@ -15,7 +15,7 @@ that were corrected before with the velocities it found.
 two neighbours are equally near.
 
 Beside them stands what is published of the real route: the authors' own odometry there, as it is and with its steps as
-much longer as a range bin is measured longer than the data set's kit has it; and CFEAR-3, a method for raw radar. Where
+much longer as a range bin is measured longer than the data set's SDK has it; and CFEAR-3, a method for raw radar. Where
 small_gicp is not installed (it has no wheels for some kinds of macOS), its rows are left out; without the real data,
 the authors'.
 """

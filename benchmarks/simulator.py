@@ -24,8 +24,8 @@ from rol_data import rall
 from rol_sim.sensors import radar as radar_sensor
 from rol_sim.sensors import radar_signal
 from rol_sim.session import oxford_files
-from rol_sim.session.settings import load_settings
-from rol_sim.session.simulation import SimulatedSession, build_session, make_scan, make_sweep, sensor_settings
+from rol_sim.session.settings import load_settings, sensor_settings
+from rol_sim.session.simulation import SimulatedSession, build_session, make_scan, make_sweep
 
 ROOT = Path(__file__).resolve().parents[1]
 

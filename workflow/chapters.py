@@ -194,7 +194,7 @@ def notebook_parameters(path: str | Path) -> dict:
 def run_parameters(config: dict, run: Run, notebooks: Path = NOTEBOOKS) -> dict:
     """Give what papermill passes to a run.
 
-    The common settings go to every notebook that asks for them; the knobs of the profile and the session and method
+    The common settings go to every notebook that asks for them; the parameters of the profile and the session and method
     of the run must be parameters of the notebook (papermill itself would only print a line and go on).
 
     Raises

@@ -30,11 +30,19 @@ def page_text(title: str, above: str, lines: list[str]) -> str:
     return "\n".join([f"# {title}", "", above, "", "```{eval-rst}", *lines, "```", ""])
 
 
-def table_of(names: list[str]) -> list[str]:
-    """Write the directive for a table of names, each linked and with the first sentence of its docstring."""
-    return (
-        [".. autosummary::", "   :nosignatures:", "", *(f"   {name}" for name in names), ""] if names else []
-    )
+def table_of(docstrings: dict[str, str | None]) -> list[str]:
+    """Write a table of full names, each linked and with the first sentence of its docstring."""
+    lines = [".. list-table::", "   :header-rows: 1", "", "   * - name", "     - what it is or does"]
+    for name, docstring in docstrings.items():
+        paragraph = " ".join((docstring or "").split("\n\n")[0].split())
+        sentence = re.split(r"(?<=[.?!]) (?=[A-Z])", paragraph)[0]
+        lines += [f"   * - :py:obj:`{name}`", f"     - {sentence}"]
+    return [*lines, ""] if docstrings else []
+
+
+def docstrings_of(files: list[Path]) -> dict[str, str | None]:
+    """Read the docstrings of modules, by their names."""
+    return {module_name(file): ast.get_docstring(ast.parse(read_text(file))) for file in files}
 
 
 def module_page(file: Path, has_example: bool) -> str:
@@ -42,13 +50,15 @@ def module_page(file: Path, has_example: bool) -> str:
     name, page = module_name(file), page_name(file)
     kinds = {ast.FunctionDef: "autofunction", ast.ClassDef: "autoclass"}
     body = ast.parse(read_text(file)).body
-    members = {m.name: kinds[type(m)] for m in body if type(m) in kinds and not m.name.startswith("_")}
+    members = [node for node in body if type(node) in kinds and not node.name.startswith("_")]
     above = f"File: `src/{file.relative_to(SOURCE).as_posix()}`."
     if has_example:
         above += f" [Example, and the files to copy]({'../' * page.count('/')}take.md#{file.stem})."
-    lines = [f".. automodule:: {name}", "", *table_of(list(members))]
-    for member, kind in members.items():
-        lines += [f".. {kind}:: {member}"] + ["   :members:"] * (kind == "autoclass") + [""]
+    table = table_of({f"~{name}.{member.name}": ast.get_docstring(member) for member in members})
+    lines = [f".. automodule:: {name}", "", *table]
+    for member in members:
+        kind = kinds[type(member)]
+        lines += [f".. {kind}:: {member.name}"] + ["   :members:"] * (kind == "autoclass") + [""]
     return page_text(name, above, lines)
 
 
@@ -63,15 +73,13 @@ def stage_toolbox(book: Path) -> list[dict]:
     examples = set(
         re.findall(r"^### \[\w+\]\((toolbox/[\w/]+)\.md\)", read_text(book / "take.md"), re.MULTILINE)
     )
-    packages = [file for file in sorted(SOURCE.glob("[!.]*/__init__.py"))]
-    entries = []
+    entries, packages = [], sorted(SOURCE.glob("[!.]*/__init__.py"))
     for package in packages:
         files = [file for file in sorted(package.parent.rglob("[!.]*.py")) if not file.name.startswith("__")]
         for file in files:
             write_text(book / f"{page_name(file)}.md", module_page(file, page_name(file) in examples))
         name = module_name(package)
-        modules = [module_name(file).removeprefix(f"{name}.") for file in files]
-        lines = [f".. automodule:: {name}", "", *table_of(modules)]
+        lines = [f".. automodule:: {name}", "", *table_of(docstrings_of(files))]
         write_text(book / f"{page_name(package)}.md", page_text(name, f"Folder: `src/{name}`.", lines))
         sections = [{"file": page_name(file)} for file in files]
         entries.append({"file": page_name(package), "sections": sections})
@@ -79,6 +87,6 @@ def stage_toolbox(book: Path) -> list[dict]:
         "One page for each module, with signature, docstring and code of every public function and class."
         " [What can be copied, and how](../take.md#what-to-copy)."
     )
-    lines = table_of([module_name(package) for package in packages])
-    write_text(book / "toolbox" / "index.md", page_text("All functions", above, lines))
+    index = page_text("All functions", above, table_of(docstrings_of(packages)))
+    write_text(book / "toolbox" / "index.md", index)
     return entries

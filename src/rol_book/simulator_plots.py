@@ -1,4 +1,4 @@
-"""Figures that set simulated scans beside real ones. Nothing here computes a result; see `rol_book.plots` for the rest."""
+"""Figures that compare simulated with real scans. Nothing here computes a result."""
 
 from __future__ import annotations
 
@@ -16,7 +16,6 @@ STYLES = (
     {"color": "#E69F00", "linestyle": "-"},
     {"color": "#009E73", "linestyle": "--"},
 )
-BIN_M, OFFSET_M = MEASURED.resolution_m, MEASURED.offset_m
 GREYS = plt.get_cmap("gray_r", 12)  # few levels: noise in fine ones makes large files and shows no more
 
 
@@ -26,7 +25,7 @@ def draw_statistics(found: Mapping[str, dict]) -> Figure:
     Parameters
     ----------
     found : mapping
-        Name of a set -> what `statistics.scan_statistics` gives for it; three sets at most, drawn in turn.
+        Name of a set -> its statistics, from `rol_study.radar_statistics.scan_statistics`; three sets at most, drawn in turn.
 
     Returns
     -------
@@ -57,7 +56,7 @@ def draw_doppler(ax: Axes, found: Mapping[str, dict]) -> Axes:
     ax : Axes
         Where to draw.
     found : mapping
-        Name of a set -> what `statistics.motion_statistics` gives for it.
+        Name of a set -> its statistics, from `rol_study.radar_statistics.motion_statistics`.
 
     Returns
     -------
@@ -74,27 +73,27 @@ def draw_doppler(ax: Axes, found: Mapping[str, dict]) -> Axes:
 
 
 def draw_auc_by_group(axes: Sequence[Axes], found: Mapping[str, Mapping[str, float]]) -> Sequence[Axes]:
-    """Draw by which patches a classifier tells simulated from real scans.
+    """Draw which patches a classifier separates simulated from real scans.
 
     Parameters
     ----------
     axes : sequence of Axes
         One for each way to sort the patches.
     found : mapping
-        What `telling.auc_by_group` gives.
+        From `rol_study.two_sample_classifier.auc_by_group`.
 
     Returns
     -------
     axes : sequence of Axes
         The axes.
     """
-    words = {"range": "range of the patch [m]", "brightest": "brightest code in the patch"}
+    labels = {"range": "range of the patch [m]", "brightest": "brightest code in the patch"}
     for ax, (name, values) in zip(axes, found.items(), strict=True):
         ax.bar(
             list(values), [value - 0.5 for value in values.values()], bottom=0.5, color="#E69F00", width=0.7
         )
         ax.axhline(0.5, color="#444444", linewidth=1.0)
-        ax.set(xlabel=words.get(name, name), ylabel="area under the curve", ylim=(0.3, 1.0))
+        ax.set(xlabel=labels.get(name, name), ylabel="area under the curve", ylim=(0.3, 1.0))
         ax.tick_params(axis="x", labelrotation=30)
     return axes
 
@@ -121,7 +120,7 @@ def draw_polar_pair(
             vmin=0,
             vmax=96,
             interpolation="antialiased",
-            extent=(OFFSET_M, OFFSET_M + BIN_M * codes.shape[1], 360, 0),
+            extent=(MEASURED.offset_m, MEASURED.offset_m + MEASURED.resolution_m * codes.shape[1], 360, 0),
         )
         ax.set(title=title, xlim=(0, max_range), yticks=np.arange(0, 361, 90), ylabel="azimuth [deg]")
         ax.grid(False)
@@ -129,21 +128,21 @@ def draw_polar_pair(
 
 
 def _draw_histogram(ax: Axes, statistics: dict, look: dict) -> None:
-    shares = statistics["histogram"]
-    codes = np.flatnonzero(shares > 0)
-    ax.semilogy(codes, shares[codes], linewidth=1.2, **look)
-    ax.set(xlabel="code", ylabel="share of pixels", title="codes", xlim=(0, 140))
+    fractions = statistics["histogram"]
+    codes = np.flatnonzero(fractions > 0)
+    ax.semilogy(codes, fractions[codes], linewidth=1.2, **look)
+    ax.set(xlabel="code", ylabel="fraction of pixels", title="codes", xlim=(0, 140))
 
 
 def _draw_zeros(ax: Axes, statistics: dict, look: dict) -> None:
-    ranges, shares = zip(*statistics["zero_fractions"].items(), strict=True)
-    ax.plot(ranges, shares, marker="o", markersize=3.5, **look)
-    ax.set(xlabel="range [m]", ylabel="share of code 0", title="quiet bins", ylim=(0.25, 0.6))
+    ranges, fractions = zip(*statistics["zero_fractions"].items(), strict=True)
+    ax.plot(ranges, fractions, marker="o", markersize=3.5, **look)
+    ax.set(xlabel="range [m]", ylabel="fraction of code 0", title="quiet bins", ylim=(0.25, 0.6))
 
 
 def _draw_range_correlation(ax: Axes, statistics: dict, look: dict) -> None:
     values = statistics["range_correlation"]
-    ax.plot(BIN_M * np.arange(1, len(values) + 1), values, marker="o", markersize=3.5, **look)
+    ax.plot(MEASURED.resolution_m * np.arange(1, len(values) + 1), values, marker="o", markersize=3.5, **look)
     ax.set(xlabel="distance along range [m]", ylabel="correlation", title="noise along range", ylim=(0, 1))
 
 
@@ -151,7 +150,7 @@ def _draw_rings(ax: Axes, statistics: dict, look: dict) -> None:
     rings = statistics["fractions_40_by_range"]
     middles = [np.sqrt(np.prod([float(edge) for edge in ring.split("-")])) for ring in rings]
     ax.loglog(middles, list(rings.values()), marker="o", markersize=3.5, **look)
-    ax.set(xlabel="range [m]", ylabel="share of codes ≥ 40", title="brightness")
+    ax.set(xlabel="range [m]", ylabel="fraction of codes ≥ 40", title="brightness")
     ax.set_xticks([5, 10, 20, 50, 100], ["5", "10", "20", "50", "100"])
     ax.minorticks_off()
 
@@ -164,5 +163,5 @@ def _draw_azimuth_spread(ax: Axes, statistics: dict, look: dict) -> None:
 
 def _draw_range_spread(ax: Axes, statistics: dict, look: dict) -> None:
     levels = statistics["point_spread"]["range_db"]
-    ax.plot(BIN_M * np.arange(len(levels)), levels, **look)
+    ax.plot(MEASURED.resolution_m * np.arange(len(levels)), levels, **look)
     ax.set(xlabel="range off the peak [m]", ylabel="level [dB]", title="a bright point in range")

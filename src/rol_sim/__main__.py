@@ -20,7 +20,7 @@ def main(arguments: list[str] | None = None) -> int:
     Returns
     -------
     status : int
-        0 if all went well, 1 after a fault, which is told on stderr.
+        0 on success, 1 after a fault, which is reported on stderr.
     """
     parser = argparse.ArgumentParser(
         prog="python -m rol_sim", description="Write simulated sessions in Oxford's files."

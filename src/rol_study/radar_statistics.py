@@ -1,8 +1,8 @@
-"""Statistics of radar scans, real or simulated: how bright, how noisy, how sharp, how regular they are.
+"""Compute statistics of radar scans, real or simulated: brightness, noise, point spread, code histogram.
 
 Every function takes the power codes of one scan, shape (400, 3768), or of several, shape (n, 400, 3768), and
-pools what it finds. The same numbers from real and from simulated scans, side by side, tell how near the
-simulator has come. Rows are azimuths and neighbours in time (the turn is not closed); columns are range bins.
+pools all of them. Comparing the numbers of real and simulated scans validates the
+simulator. Rows are azimuths and neighbours in time (the turn is not closed); columns are range bins.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ FAR_BIN = 3000
 
 
 def forbidden_codes() -> np.ndarray:
-    """List the codes that no scan can hold, because the sensor's powers are integers.
+    """List the codes that cannot occur, because the sensor's powers are integers.
 
     Returns
     -------
@@ -41,7 +41,7 @@ def forbidden_codes() -> np.ndarray:
 def brightness_fractions(
     codes: np.ndarray, codes_from: tuple[int, ...] = BRIGHTNESS_CODES
 ) -> dict[int, float]:
-    """Give the share of pixels at or above each code.
+    """Compute the fraction of pixels at or above each code.
 
     Parameters
     ----------
@@ -52,8 +52,8 @@ def brightness_fractions(
 
     Returns
     -------
-    shares : dict
-        Code -> share of all pixels [0..1].
+    fractions : dict
+        Code -> fraction of all pixels [0..1].
     """
     counts = np.bincount(np.asarray(codes).ravel(), minlength=256)
     tail = counts[::-1].cumsum()[::-1] / counts.sum()
@@ -61,7 +61,7 @@ def brightness_fractions(
 
 
 def code_histogram(codes: np.ndarray) -> np.ndarray:
-    """Give the share of pixels of every code.
+    """Compute the fraction of pixels of every code.
 
     Parameters
     ----------
@@ -70,7 +70,7 @@ def code_histogram(codes: np.ndarray) -> np.ndarray:
 
     Returns
     -------
-    shares : array, shape (256,)
+    fractions : array, shape (256,)
         They sum to one.
     """
     counts = np.bincount(np.asarray(codes).ravel(), minlength=256)
@@ -78,7 +78,7 @@ def code_histogram(codes: np.ndarray) -> np.ndarray:
 
 
 def hellinger_distance(p: np.ndarray, q: np.ndarray) -> float:
-    """Give the distance of two histograms: 0 for equal ones, 1 for those without a common code.
+    """Compute the distance of two histograms: 0 for equal ones, 1 for those without a common code.
 
     Parameters
     ----------
@@ -96,7 +96,7 @@ def hellinger_distance(p: np.ndarray, q: np.ndarray) -> float:
 def zero_fractions(
     codes: np.ndarray, ranges_m: tuple[float, ...] = ZERO_RANGES_M, half_bins: int = 15
 ) -> dict:
-    """Give the share of code 0 in quiet bins at several ranges.
+    """Compute the fraction of code 0 in quiet bins at several ranges.
 
     Parameters
     ----------
@@ -105,25 +105,25 @@ def zero_fractions(
     ranges_m : tuple of float
         Ranges, counted as bin * MEASURED.resolution_m [m].
     half_bins : int
-        Pieces of 2 * half_bins bins around a range are looked at; those that reach code 30 are left out.
+        Pieces of 2 * half_bins bins around a range are used; those that reach code 30 are discarded.
 
     Returns
     -------
-    shares : dict
-        Range [m] -> share of zeros [0..1]; NaN where no piece is quiet.
+    fractions : dict
+        Range [m] -> fraction of zeros [0..1]; NaN where no piece is quiet.
     """
     scans = _rows(codes)
-    shares = {}
+    fractions = {}
     for range_m in ranges_m:
         middle = round(range_m / MEASURED.resolution_m)
         piece = scans[:, max(middle - half_bins, 0) : middle + half_bins]
         quiet = piece[piece.max(axis=1) < QUIET_CODE]
-        shares[range_m] = float((quiet == 0).mean()) if len(quiet) else float("nan")
-    return shares
+        fractions[range_m] = float((quiet == 0).mean()) if len(quiet) else float("nan")
+    return fractions
 
 
 def noise_correlation(codes: np.ndarray, lags: int = 7, bins: tuple[int, int] = (700, 1100)) -> list[float]:
-    """Measure how alike the codes of quiet bins are along the range.
+    """Estimate the correlation of noise along the range, in quiet bins.
 
     Parameters
     ----------
@@ -132,7 +132,7 @@ def noise_correlation(codes: np.ndarray, lags: int = 7, bins: tuple[int, int] = 
     lags : int
         Greatest distance in bins.
     bins : tuple of int
-        Range bins looked at; the quieter 30 % of the rows (by their greatest code there) are taken.
+        Range bins to use; the quieter 30 % of the rows (by their greatest code there) are taken.
 
     Returns
     -------
@@ -150,14 +150,14 @@ def noise_correlation(codes: np.ndarray, lags: int = 7, bins: tuple[int, int] = 
 
 
 def azimuth_correlation(codes: np.ndarray, bins: tuple[int, int] = (1500, 1900)) -> float:
-    """Measure how alike the noise of neighbouring azimuths is.
+    """Estimate the correlation of noise between neighbouring azimuths.
 
     Parameters
     ----------
     codes : array, shape (..., 400, 3768), uint8
         Scans.
     bins : tuple of int
-        Range bins looked at; pairs of neighbours that are both among the quieter 30 % are taken.
+        Range bins to use; pairs of neighbours that are both among the quieter 30 % are taken.
 
     Returns
     -------
@@ -174,7 +174,7 @@ def azimuth_correlation(codes: np.ndarray, bins: tuple[int, int] = (1500, 1900))
 
 
 def near_field(codes: np.ndarray, ranges_m: tuple[float, ...] = NEAR_RANGES_M) -> dict[float, float]:
-    """Give the mean code of the leakage close to the sensor.
+    """Compute the mean code of the leakage close to the sensor.
 
     Parameters
     ----------
@@ -193,7 +193,7 @@ def near_field(codes: np.ndarray, ranges_m: tuple[float, ...] = NEAR_RANGES_M) -
 
 
 def floor_by_peak(codes: np.ndarray, edges: tuple[int, ...] = PEAK_EDGES) -> dict[str, float]:
-    """Give the floor far out, for rows sorted by their strongest return.
+    """Compute the noise floor at far range, for rows grouped by their strongest return.
 
     Parameters
     ----------
@@ -217,7 +217,7 @@ def floor_by_peak(codes: np.ndarray, edges: tuple[int, ...] = PEAK_EDGES) -> dic
 
 
 def point_spread(codes: np.ndarray, reach: tuple[int, int] = (5, 16)) -> dict[str, list[float]]:
-    """Measure how a strong point is smeared over azimuth and range.
+    """Measure the point spread over azimuth and range, from strong peaks.
 
     Parameters
     ----------
@@ -255,10 +255,10 @@ def motion_statistics(
     scan_seconds: float = 0.25,
     doppler_seconds: tuple[float, ...] = tuple(np.arange(-0.06, 0.1501, 0.01)),
 ) -> dict:
-    """Measure what the car's motion does to scans: the turn is a spiral, and what comes nearer reads nearer.
+    """Measure the effect of motion compensation and Doppler correction on the agreement of scans.
 
-    Scans from places some metres apart are laid on each other by their known poses. What stood ahead of the one
-    stands abeam of the other, so a wrong range ahead shows; how well they agree says which correction is right.
+    Scans some metres apart are aligned by their known poses. An object ahead in the first is abeam in the second, so
+    a range error ahead reduces their correlation.
 
     Parameters
     ----------
@@ -271,24 +271,26 @@ def motion_statistics(
     scan_seconds : float
         Time of a turn [s].
     doppler_seconds : tuple of float
-        Doppler range shifts per closing speed to be tried [s].
+        Doppler range shifts per closing speed to try [s].
 
     Returns
     -------
     statistics : dict
-        "metres_per_turn": mean way; "correlation_raw", "correlation_motion", "correlation_both": mean
-        correlation of the Cartesian images of such pairs, uncorrected, with the motion during the turn taken
-        out, and with the best Doppler shift as well; "doppler_seconds": that shift [s], positive where what is
+        "metres_per_turn": mean distance driven in a turn; "correlation_raw", "correlation_motion", "correlation_both": mean
+        correlation of the Cartesian images of such pairs, uncorrected, with motion
+        compensation, and with the best Doppler shift as well; "doppler_seconds": that shift [s], positive where what is
         ahead reads nearer; "doppler_curve": correlation of every shift tried.
     """
-    steps, ways = relative_pose(poses[:-1], poses[1:]), relative_pose(poses[:-lag], poses[lag:])
-    twists = np.vstack([steps, steps[-1:]]) / scan_seconds
-    curve = {float(shift): _mean_correlation(codes, ways, lag, twists, shift) for shift in doppler_seconds}
+    odometry, increments = relative_pose(poses[:-1], poses[1:]), relative_pose(poses[:-lag], poses[lag:])
+    twists = np.vstack([odometry, odometry[-1:]]) / scan_seconds
+    curve = {
+        float(shift): _mean_correlation(codes, increments, lag, twists, shift) for shift in doppler_seconds
+    }
     best = max(curve, key=curve.__getitem__)
     return {
-        "metres_per_turn": float(np.hypot(steps[:, 0], steps[:, 1]).mean()),
-        "correlation_raw": _mean_correlation(codes, ways, lag, None, 0.0),
-        "correlation_motion": _mean_correlation(codes, ways, lag, twists, 0.0),
+        "metres_per_turn": float(np.hypot(odometry[:, 0], odometry[:, 1]).mean()),
+        "correlation_raw": _mean_correlation(codes, increments, lag, None, 0.0),
+        "correlation_motion": _mean_correlation(codes, increments, lag, twists, 0.0),
         "correlation_both": curve[best],
         "doppler_seconds": best,
         "doppler_curve": curve,
@@ -296,9 +298,9 @@ def motion_statistics(
 
 
 def _mean_correlation(
-    codes: np.ndarray, ways: np.ndarray, lag: int, twists: np.ndarray | None, doppler_seconds: float
+    codes: np.ndarray, increments: np.ndarray, lag: int, twists: np.ndarray | None, doppler_seconds: float
 ) -> float:
-    """Mean correlation of scans i and i + lag, as images of 0.25 m per pixel laid on each other."""
+    """Mean correlation of scans i and i + lag, as aligned images of 0.25 m per pixel."""
     azimuths = beam_azimuths()
     width, pixel, found = 512, 0.25, []
     middle = (width - 1) / 2.0
@@ -315,7 +317,7 @@ def _mean_correlation(
     ]
     away = np.hypot(*(np.mgrid[:width, :width] - middle)) * pixel
     own = np.where((away > 4.0) & (away < 50.0), np.float32(0.0), np.float32(np.nan))  # no leakage
-    for before, after, (x, y, yaw) in zip(images[:-lag], images[lag:], ways, strict=True):
+    for before, after, (x, y, yaw) in zip(images[:-lag], images[lag:], increments, strict=True):
         # Column c and row r show the place (middle - r, middle - c) * pixel; both axes fall, so a turn stays one.
         c, s = np.cos(yaw), np.sin(yaw)
         forward = np.array([[c, s, 0.0], [-s, c, 0.0]])
@@ -327,7 +329,7 @@ def _mean_correlation(
 
 
 def scan_statistics(codes: np.ndarray) -> dict:
-    """Measure all that one scan, or a few, can tell about its sensor.
+    """Compute all statistics of one scan or several.
 
     Parameters
     ----------
@@ -337,11 +339,11 @@ def scan_statistics(codes: np.ndarray) -> dict:
     Returns
     -------
     statistics : dict
-        "histogram": share of every code; "shares": code -> share of pixels at or above it; "zero_fractions": range [m] -> share of code 0 in quiet
+        "histogram": fraction of every code; "fractions": code -> fraction of pixels at or above it; "zero_fractions": range [m] -> fraction of code 0 in quiet
         bins; "range_correlation": of the noise at lags 1-7 bins; "azimuth_correlation"; "near_field": range
         [m] -> mean code; "near_copies": True when bins 0-4 are identical; "floors": class of peak -> far
         floor; "point_spread": levels [dB] by distance; "forbidden": number of pixels with a code that cannot
-        be; "greatest": greatest code; "fractions_40_by_range": share of codes >= 40 by range, edges [m] as keys.
+        occur; "greatest": greatest code; "fractions_40_by_range": fraction of codes >= 40 by range, edges [m] as keys.
 
     Raises
     ------
@@ -354,7 +356,7 @@ def scan_statistics(codes: np.ndarray) -> dict:
     near = _rows(codes)[:, :5]
     return {
         "histogram": code_histogram(codes),
-        "shares": brightness_fractions(codes),
+        "fractions": brightness_fractions(codes),
         "fractions_40_by_range": fractions_by_range(codes, 40),
         "zero_fractions": zero_fractions(codes),
         "range_correlation": noise_correlation(codes),
@@ -371,7 +373,7 @@ def scan_statistics(codes: np.ndarray) -> dict:
 def fractions_by_range(
     codes: np.ndarray, code: int, edges_m: tuple[float, ...] = (2.5, 5, 10, 20, 30, 50, 80, 110, 165)
 ) -> dict:
-    """Give the share of pixels at or above a code, ring by ring.
+    """Compute the fraction of pixels at or above a code, ring by ring.
 
     Parameters
     ----------
@@ -384,13 +386,13 @@ def fractions_by_range(
 
     Returns
     -------
-    shares : dict
-        "low-high" [m] -> share [0..1].
+    fractions : dict
+        "low-high" [m] -> fraction [0..1].
     """
     scans, bins = _rows(codes), [round(edge / MEASURED.resolution_m) for edge in edges_m]
     names = [f"{low:g}-{high:g}" for low, high in pairwise(edges_m)]
-    shares = [float((scans[:, low:high] >= code).mean()) for low, high in pairwise(bins)]
-    return dict(zip(names, shares, strict=True))
+    fractions = [float((scans[:, low:high] >= code).mean()) for low, high in pairwise(bins)]
+    return dict(zip(names, fractions, strict=True))
 
 
 def map_fractions(
@@ -403,7 +405,7 @@ def map_fractions(
     min_code: int = 70,
     max_range_m: float = 64.0,
 ) -> np.ndarray:
-    """Give the share of raw radar peaks that lie near a map point, scan by scan.
+    """Compute the fraction of raw radar peaks that lie near a map point, scan by scan.
 
     Parameters
     ----------
@@ -421,10 +423,10 @@ def map_fractions(
 
     Returns
     -------
-    shares : array, shape (n, len(within_m))
-        Share of the peaks of each scan; NaN for a scan without peaks.
+    fractions : array, shape (n, len(within_m))
+        Fraction of the peaks of each scan; NaN for a scan without peaks.
     """
-    tree, shares = cKDTree(map_points), []
+    tree, fractions = cKDTree(map_points), []
     for scan, pose in zip(codes, poses, strict=True):
         peaks = k_strongest_peaks(
             scan,
@@ -435,8 +437,8 @@ def map_fractions(
             calibration=MEASURED,
         )
         gaps = tree.query(transform_points(pose, peaks))[0]
-        shares.append([float(np.mean(gaps < limit)) if len(gaps) else float("nan") for limit in within_m])
-    return np.array(shares)
+        fractions.append([float(np.mean(gaps < limit)) if len(gaps) else float("nan") for limit in within_m])
+    return np.array(fractions)
 
 
 def _rows(codes: np.ndarray) -> np.ndarray:

@@ -1,7 +1,7 @@
-"""Clouds for the real route: the simulated radar at the true poses of a real session, through a network.
+"""Render points on the real route: simulated radar scans at the true poses of a real session, through a network.
 
-The public data hold map, poses and odometry of the paper's sessions, but no scans. Here the scans are made: the world is
-grown from the real map, the simulated car drives through the real poses, and what its radar sees goes through the network.
+The public data hold map, poses and odometry of the paper's sessions, but no scans. So the scans are simulated in a world
+that is built from the real map.
 """
 
 from __future__ import annotations
@@ -22,80 +22,47 @@ from rol_data import rall
 from rol_sim.session.settings import parse_settings
 from rol_sim.session.simulation import SimulatedSession, build_session, make_scan
 
-STREET = {"parked_share": 0.15, "vehicles": 10, "people": 6}  # as for the twins of the real scans
+STREET = {"parked_share": 0.15, "vehicles": 10, "people": 6}  # as for the simulated twins of the real scans
 
 
-def render_points(
-    real_root: Path | str,
-    number: str,
-    first_scan: int,
-    n_scans: int,
-    network: TrainedNetwork,
-    seed: int,
-    *,
-    bf16: bool = False,
-    tta_rotations: int | None = None,
-    **changes: Any,
-) -> Iterator[np.ndarray]:
-    """Give the fake lidar points of a stretch of a real session, scan by scan, as its radar might have led to them.
+def build_segment(
+    real_root: Path | str, number: str, first_scan: int, n_scans: int, seed: int, **changes: Any
+) -> SimulatedSession:
+    """Build a simulated session along a segment of a real session's trajectory.
 
-    Real are the map and the poses, and with them the speed and the stops. Simulated are the radar, the heights and materials
-    of the world, what the map does not show or shows no more, and who is met.
+    The map and the poses are real, and with them speed and stops. The radar, the heights and materials of the world, the
+    changes since the map was made and the traffic are simulated.
 
     Parameters
     ----------
     real_root : path
         Folder of the real data, see `rol_data.rall.find_real_root`.
     number : str
-        Of the session, such as "02".
+        Number of the session, such as "02".
     first_scan, n_scans : int
-        Where in ``pose_xy_<number>.txt`` the stretch begins, and how many scans it has: at least 3, or 0 for all that follow.
-    network : TrainedNetwork
-        From `rol.pix2pix.load_network`; threshold and thinning are its own.
+        First scan in ``pose_xy_<number>.txt``, and number of scans: at least 3, or 0 for all that follow.
     seed : int
-        Draws all that is simulated: the same seed, the same world for all sessions, each on a day of its own.
-    bf16, tta_rotations
-        Of `rol_beyond.front_ends.generate_points`.
+        Draws all that is simulated: the same seed gives the same world for all sessions, each on a day of its own.
     **changes
-        Settings of `SessionSettings` other than those of the twins in chapter 1, such as ``changed_share``.
-
-    Yields
-    ------
-    cloud : array, shape (k, 2)
-        Points in the radar frame at mid-scan, the time of the pose; x forward, y left [m].
-
-    Raises
-    ------
-    SettingsError
-        If the file holds no such scans, a setting is at fault, or there are no real data.
-    rol_data.rall.RallError
-        If there is no such session, or its file or the map is at fault. All of these before the first cloud is asked for.
-
-    Notes
-    -----
-    The public poses have no times: scans are taken to be a quarter of a second apart, give or take the radar's own 1.5 ms.
-    The car moves while its radar turns. This is taken out as in the live chain, but by a velocity from the true poses, at
-    the ends of the stretch from one side only; errors of an odometry do not enter.
-
-    In memory are the map, one scan, and the world within 180 m of the stretch. What has changed since the map was made is
-    drawn for a stretch: another ``first_scan`` or ``n_scans`` is another day.
-
-    The network `unet` was trained on this route, in such a world of seed 21: from scans 0 to 4999 of session 02 but for the
-    surroundings of the eleven real scans and of one more place (``sets`` in its card). Clouds from there flatter it.
-    """
-    session = build_segment(real_root, number, first_scan, n_scans, seed, **changes)
-    return _generate(session, network, bf16=bf16, tta_rotations=tta_rotations)
-
-
-def build_segment(
-    real_root: Path | str, number: str, first_scan: int, n_scans: int, seed: int, **changes: Any
-) -> SimulatedSession:
-    """Prepare the trajectory along a stretch of a real session, see `render_points`.
+        Settings of `SessionSettings` other than `STREET`, such as ``changed_share``.
 
     Returns
     -------
     session : SimulatedSession
         Ready for `make_scan`. It has no sweeps.
+
+    Raises
+    ------
+    SettingsError
+        If the file holds no such scans, a setting is invalid, or there are no real data.
+    rol_data.rall.RallError
+        If there is no such session, or its file or the map is at fault.
+
+    Notes
+    -----
+    The public poses have no times: scans are assumed to be a quarter of a second apart, with the radar's own spread of
+    1.5 ms. In memory are the map and the world within 180 m of the segment. Changes since the map was made are drawn for a
+    segment: another ``first_scan`` or ``n_scans`` is another day.
     """
     name, path = f"sim-rendered-{number}", Path(real_root) / rall.POSES_PATH / f"pose_xy_{number}.txt"
     own = {
@@ -112,14 +79,45 @@ def build_segment(
     return build_session(parse_settings(section, str(path)), name)
 
 
-def _generate(session: SimulatedSession, network: TrainedNetwork, **how: Any) -> Iterator[np.ndarray]:
+def render_points(
+    session: SimulatedSession,
+    network: TrainedNetwork,
+    *,
+    bf16: bool = False,
+    tta_rotations: int | None = None,
+) -> Iterator[np.ndarray]:
+    """Generate the lidar points of a simulated session, scan by scan: radar scan, motion compensation, network.
+
+    Parameters
+    ----------
+    session : SimulatedSession
+        From `build_segment`.
+    network : TrainedNetwork
+        From `rol.pix2pix.load_network`, with its threshold and thinning.
+    bf16, tta_rotations
+        As in `rol_beyond.front_ends.generate_points`.
+
+    Yields
+    ------
+    points : array, shape (k, 2)
+        Points in the radar frame at mid-scan, the time of the pose; x forward, y left [m].
+
+    Notes
+    -----
+    Motion is compensated as in the pipeline, but by the velocity of the true poses, one-sided at the ends of the segment:
+    errors of an odometry do not enter.
+
+    The network `unet` was trained on this route, in such a world of seed 21: on scans 0 to 4999 of session 02 but for the
+    surroundings of the eleven real scans and of one more place (``sets`` in its card). Its points there are too good.
+    """
+    how = {"bf16": bf16, "tta_rotations": tta_rotations}
     for index, twist in enumerate(true_twists(session)):
         scan = make_scan(session, index)
         yield generate_points(network, scan.power, scan.azimuths, tuple(twist), **how)[0]
 
 
 def true_twists(session: SimulatedSession) -> np.ndarray:
-    """Give the body velocity at every scan from the true poses, as `rol.pairs.estimate_twists` does from an odometry.
+    """Compute the body velocity at every scan from the true poses, as `rol.pairs.estimate_twists` does from an odometry.
 
     Parameters
     ----------

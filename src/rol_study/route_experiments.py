@@ -58,7 +58,7 @@ class RouteExperiment:
         The real map [m].
     front_end : FrontEnd
         Properties of the sampled points.
-    sight : VisiblePoints
+    visible : VisiblePoints
         Points of the map visible from each true pose.
     parts : array, shape (3,)
         Parts of near points, points beside and false ones that have the front end's precision over the whole session.
@@ -76,7 +76,7 @@ class RouteExperiment:
     session: RouteSession
     map_points: np.ndarray
     front_end: FrontEnd
-    sight: VisiblePoints
+    visible: VisiblePoints
     parts: np.ndarray
     motion: MotionModel
     calibration_session: str
@@ -129,8 +129,8 @@ def prepare_experiment(
     poses = poses[np.linspace(0, len(poses) - 1, min(n_reference, len(poses))).astype(int)]
     grid = (settings or settings_for("robust")).measurement.build_grid(map_points)
     reference = _measure_reference(map_points, poses, front_end, grid)
-    sight = find_visible_points(map_points, session.truth)
-    return RouteExperiment(session, map_points, front_end, sight, parts, motion, other, reference, grid)
+    visible = find_visible_points(map_points, session.truth)
+    return RouteExperiment(session, map_points, front_end, visible, parts, motion, other, reference, grid)
 
 
 def _measure_reference(
@@ -138,17 +138,17 @@ def _measure_reference(
 ) -> float:
     """Measure the reference contrast at another session's poses; without them give the published one."""
     if not len(poses):
-        return published_reference_contrast(front_end.share_1m)
-    sight, rng = find_visible_points(map_points, poses), np.random.default_rng(0)
-    clouds = sample_points(map_points, poses, sight, front_end, rng)
+        return published_reference_contrast(front_end.fraction_1m)
+    visible, rng = find_visible_points(map_points, poses), np.random.default_rng(0)
+    clouds = sample_points(map_points, poses, visible, front_end, rng)
     return measure_reference_contrast(clouds, poses, grid)
 
 
 def _find_parts(map_points: np.ndarray, poses: np.ndarray, front_end: FrontEnd) -> np.ndarray:
     """Find the parts of the kinds of points that have the front end's precision on average over poses."""
-    sight, rng = find_visible_points(map_points, poses), np.random.default_rng(0)
-    kinds = measure_fractions(map_points, poses, sight, front_end, rng)
-    return solve_mixture(kinds, front_end.share_1m, front_end.share_2m)
+    visible, rng = find_visible_points(map_points, poses), np.random.default_rng(0)
+    kinds = measure_fractions(map_points, poses, visible, front_end, rng)
+    return solve_mixture(kinds, front_end.fraction_1m, front_end.fraction_2m)
 
 
 def sample_session(experiment: RouteExperiment, seed: int) -> list[np.ndarray]:
@@ -167,7 +167,7 @@ def sample_session(experiment: RouteExperiment, seed: int) -> list[np.ndarray]:
         One per scan, in the radar frame [m].
     """
     rng, e = np.random.default_rng([seed, int(experiment.session.number)]), experiment
-    return list(sample_points(e.map_points, e.session.truth, e.sight, e.front_end, rng, e.parts))
+    return list(sample_points(e.map_points, e.session.truth, e.visible, e.front_end, rng, e.parts))
 
 
 @dataclass(frozen=True)
@@ -482,9 +482,9 @@ def run_from(
     """
     _check_first(experiment, first)
     e, poses = experiment, experiment.session.truth[first : first + n_scans]
-    rng, starts = np.random.default_rng([seed, first]), e.sight.starts[first : first + len(poses) + 1]
-    sight = VisiblePoints(e.sight.points[starts[0] : starts[-1]], starts - starts[0])
-    sampling = sample_points(e.map_points, poses, sight, e.front_end, rng, e.parts)
+    rng, starts = np.random.default_rng([seed, first]), e.visible.starts[first : first + len(poses) + 1]
+    visible = VisiblePoints(e.visible.points[starts[0] : starts[-1]], starts - starts[0])
+    sampling = sample_points(e.map_points, poses, visible, e.front_end, rng, e.parts)
     updates, clouds, n_found = [], [], 0
 
     def keep_clouds() -> Iterator[np.ndarray]:

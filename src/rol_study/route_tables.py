@@ -25,7 +25,7 @@ from rol_beyond.recovery import DetectionSettings, RecoverySettings
 from rol_beyond.robust import settings_for
 from rol_data.rall import POSES_PATH, load_poses
 from rol_study.oxford_route import RouteSession, list_sessions
-from rol_study.rendered_points import render_points
+from rol_study.rendered_points import build_segment, render_points
 from rol_study.route_experiments import (
     FilterRun,
     RouteExperiment,
@@ -193,7 +193,8 @@ def measure_rendered(
     """Run both methods on points generated from the simulated radar, on a segment that the network was not trained on."""
     torch.set_num_threads(1)
     experiment = experiment_of(real_root, number, (0.80, 0.88))
-    clouds = list(render_points(real_root, number, first, n_scans, load_network(weights), seed))
+    simulated = build_segment(real_root, number, first, n_scans, seed)
+    clouds = list(render_points(simulated, load_network(weights)))
     truth, increments = (
         experiment.session.truth[first : first + n_scans],
         experiment.session.increments[first : first + n_scans - 1],

@@ -1,14 +1,14 @@
-"""Points as a front end of stated quality would give them, drawn from a lidar map at true poses: no radar, no network.
+"""Sample points from a lidar map at true poses, with the precision of a given front end: no radar, no network.
 
-The paper's front end is known by two numbers, the shares of its points within 1 m and 2 m of the lidar's (Sec. IV-B).
-Here every scan is a mixture of three kinds of points, mixed so that these two shares come out:
+The paper states two numbers of its front end, the fractions of its points within 1 m and 2 m of the lidar's (Sec. IV-B).
+Here every scan is a mixture of three kinds of points with these two fractions:
 
 - *near*: cells of the map that the radar could see from the true pose, with a small error;
-- *beside*: points between 1 m and 2 m off the map, as a front that is drawn too thick or twice;
-- *false*: anywhere within reach. Some are there once, some stand in the world for a while, some ride with the car.
+- *beside*: points between 1 m and 2 m off the map, as of walls that are generated too thick or twice;
+- *false*: anywhere within range. Some last one scan, some are static in the world for a while, some move with the car.
 
-A map is full: of false points alone, about 30 % lie within 1 m of one of its points and 47 % within 2 m on the real route.
-So at the paper's shares no more than one point in six is true.
+Maps are dense: about 30 % of the false points lie within 1 m of a map point and 47 % within 2 m on the real route.
+So at the paper's fractions no more than one point in six is true.
 
 All clouds are in the radar frame, x forward, y left [m].
 """
@@ -28,27 +28,27 @@ KINDS = ("near", "beside", "false")
 
 
 class SampledPointsError(ValueError):
-    """Raised for a map or poses from which no points can be drawn, and for a quality that cannot be had."""
+    """No points can be sampled from the map or the poses, or no mixture has the given fractions."""
 
 
 @dataclass(frozen=True)
 class FrontEnd:
-    """What a front end's points are like.
+    """Properties of a front end's points.
 
     Attributes
     ----------
-    share_1m, share_2m : float
-        Shares of the points within 1 m and 2 m of a point of the map; 0.4 and 0.6 are the paper's (Sec. IV-B).
+    fraction_1m, fraction_2m : float
+        Fractions of the points within 1 m and 2 m of a point of the map; 0.4 and 0.6 are the paper's (Sec. IV-B).
     n_points : int
         Points of a scan. The paper gives no number.
     near_m : float
         Standard deviation of a near point's error in x and in y [m].
-    persistent_share : float
-        Share of the false points that are seen again, half of them standing in the world, half riding with the car.
+    persistent_fraction : float
+        Fraction of the false points that last, half of them static in the world, half moving with the car.
     life_scans : float
-        How many scans such a point is seen on average.
+        Mean lifetime of such a point in scans.
     min_range_m, max_range_m : float
-        Reach of the front end [m]; 64 m is the paper's.
+        Range limits of the front end [m]; 64 m is the paper's.
 
     Raises
     ------
@@ -56,18 +56,18 @@ class FrontEnd:
         If a value is out of its range; the message names it.
     """
 
-    share_1m: float = 0.40
-    share_2m: float = 0.60
+    fraction_1m: float = 0.40
+    fraction_2m: float = 0.60
     n_points: int = 400
     near_m: float = 0.3
-    persistent_share: float = 0.5
+    persistent_fraction: float = 0.5
     life_scans: float = 8.0
     min_range_m: float = 2.5
     max_range_m: float = 64.0
 
     def __post_init__(self) -> None:
         allowed = {
-            "[0, 1]": "share_1m share_2m persistent_share",
+            "[0, 1]": "fraction_1m fraction_2m persistent_fraction",
             "[0, inf)": "n_points near_m min_range_m",
             "[1, inf)": "life_scans",
             "(0, inf)": "max_range_m",
@@ -77,12 +77,12 @@ class FrontEnd:
 
 @dataclass(frozen=True)
 class VisiblePoints:
-    """What can be seen of a map from many poses.
+    """Visible cells of a map from many poses.
 
     Attributes
     ----------
     points : array of int16, shape (m, 2)
-        Seen cells in the frame of the radar that sees them [cm], one pose after the other.
+        Visible cells in the radar frame [cm], pose after pose.
     starts : array of int64, shape (n + 1,)
         Pose i has the points ``starts[i] : starts[i + 1]``.
     """
@@ -94,7 +94,7 @@ class VisiblePoints:
         return len(self.starts) - 1
 
     def __getitem__(self, index: int) -> np.ndarray:
-        """Give what pose `index` sees, shape (k, 2) [m]."""
+        """Return the points visible from pose `index`, shape (k, 2) [m]."""
         return self.points[self.starts[index] : self.starts[index + 1]] * 0.01
 
 
@@ -108,7 +108,7 @@ def find_visible_points(
     n_surfaces: int = 2,
     depth_m: float = 1.0,
 ) -> VisiblePoints:
-    """Find the cells of a map that beams from each pose reach before something stands in their way.
+    """Find the map cells that are visible from each pose, by casting beams.
 
     Parameters
     ----------
@@ -117,20 +117,20 @@ def find_visible_points(
     poses : array, shape (n, 3)
         Poses T_map_radar [m, m, rad].
     cell : float
-        Side of a cell of the grid that is looked at [m].
+        Side of a cell of the occupancy grid [m].
     max_range_m : float
         Where a beam ends [m].
     n_beams : int
         Beams of a turn; 400 are the radar's azimuths.
     n_surfaces : int
-        Surfaces that a beam shows before it is spent: a radar sees through the first bush.
+        Surfaces that a beam hits before it ends: a radar sees through the first bush.
     depth_m : float
         Cells of a beam closer together than this belong to one surface [m].
 
     Returns
     -------
-    sight : VisiblePoints
-        Middles of the cells seen, each once per pose.
+    visible : VisiblePoints
+        Centres of the visible cells, each once per pose.
 
     Raises
     ------
@@ -157,7 +157,7 @@ def find_visible_points(
 
 @compiled
 def _cast(occupied, u0, v0, yaw, n_beams, reach, n_surfaces, depth):
-    """Cells seen from one place, in its own frame and in cells, shape (k, 2)."""
+    """Cells visible from one pose, in its own frame and in cells, shape (k, 2)."""
     h, w = occupied.shape
     hits = np.empty(n_beams * 2 * n_surfaces * (int(depth) + 2), dtype=np.int64)
     n = 0
@@ -188,31 +188,31 @@ def _cast(occupied, u0, v0, yaw, n_beams, reach, n_surfaces, depth):
     return points
 
 
-def solve_mixture(shares: np.ndarray, share_1m: float, share_2m: float) -> np.ndarray:
-    """Find how to mix the three kinds of points so that two shares come out.
+def solve_mixture(fractions: np.ndarray, fraction_1m: float, fraction_2m: float) -> np.ndarray:
+    """Solve for the mixture of the three kinds of points that has two given fractions.
 
     Parameters
     ----------
-    shares : array, shape (2, 3)
-        Share of the points of each kind (columns: near, beside, false) within 1 m (first row) and 2 m of the map.
-    share_1m, share_2m : float
-        What the mixture is to have.
+    fractions : array, shape (2, 3)
+        Fraction of the points of each kind (columns: near, beside, false) within 1 m (first row) and 2 m of the map.
+    fraction_1m, fraction_2m : float
+        Fractions of the mixture.
 
     Returns
     -------
     weights : array, shape (3,)
-        Parts of the kinds, in 0..1, their sum 1.
+        Weights of the kinds, in 0..1, of sum 1.
 
     Raises
     ------
     SampledPointsError
-        If no mixture has these shares.
+        If no mixture has these fractions.
     """
-    weights = np.linalg.solve(np.vstack([shares, np.ones(3)]), [share_1m, share_2m, 1.0])
+    weights = np.linalg.solve(np.vstack([fractions, np.ones(3)]), [fraction_1m, fraction_2m, 1.0])
     if (weights < -1e-9).any():
         told = ", ".join(f"{kind} {weight:.2f}" for kind, weight in zip(KINDS, weights, strict=True))
         raise SampledPointsError(
-            f"no mixture of points has {share_1m:.2f} within 1 m and {share_2m:.2f} within 2 m here: it would need {told}"
+            f"no mixture of points has {fraction_1m:.2f} within 1 m and {fraction_2m:.2f} within 2 m here: it would need {told}"
         )
     return np.clip(weights, 0.0, 1.0)
 
@@ -220,12 +220,12 @@ def solve_mixture(shares: np.ndarray, share_1m: float, share_2m: float) -> np.nd
 def measure_fractions(
     map_points: np.ndarray,
     poses: np.ndarray,
-    sight: VisiblePoints,
+    visible: VisiblePoints,
     front_end: FrontEnd,
     rng: np.random.Generator,
     n_scans: int = 100,
 ) -> np.ndarray:
-    """Measure how many points of each kind lie near the map, by drawing some at a sample of the poses.
+    """Measure the fractions of points of each kind near the map, by sampling at some of the poses.
 
     Parameters
     ----------
@@ -233,8 +233,8 @@ def measure_fractions(
         Points of the map [m].
     poses : array, shape (n, 3)
         Poses T_map_radar [m, m, rad].
-    sight : VisiblePoints
-        What these poses see.
+    visible : VisiblePoints
+        Visible cells of these poses.
     front_end : FrontEnd
         Errors and reach.
     rng : numpy.random.Generator
@@ -244,18 +244,18 @@ def measure_fractions(
 
     Returns
     -------
-    shares : array, shape (2, 3)
+    fractions : array, shape (2, 3)
         For `solve_mixture`.
 
     Raises
     ------
     SampledPointsError
-        If none of these poses sees anything of the map.
+        If nothing of the map is visible from any of these poses.
     """
     tree, found = cKDTree(map_points), []
     for index in np.linspace(0, len(poses) - 1, min(n_scans, len(poses))).astype(int):
-        if len(sight[index]):
-            clouds = _draw_near(sight[index], 300, front_end, rng), _draw_anywhere(300, front_end, rng)
+        if len(visible[index]):
+            clouds = _sample_near(visible[index], 300, front_end, rng), _sample_anywhere(300, front_end, rng)
             near, false = (tree.query(transform_points(poses[index], cloud))[0] for cloud in clouds)
             found.append(
                 [
@@ -264,19 +264,19 @@ def measure_fractions(
                 ]
             )
     if not found:
-        raise SampledPointsError("nothing of the map can be seen from any of the poses")
+        raise SampledPointsError("nothing of the map is visible from any of the poses")
     return np.mean(found, axis=0)
 
 
 def sample_points(
     map_points: np.ndarray,
     poses: np.ndarray,
-    sight: VisiblePoints,
+    visible: VisiblePoints,
     front_end: FrontEnd,
     rng: np.random.Generator,
-    parts: np.ndarray | None = None,
+    mixture: np.ndarray | None = None,
 ) -> Iterator[np.ndarray]:
-    """Draw the cloud of each scan of a drive, one after the other.
+    """Sample the points of each scan of a trajectory, one scan after the other.
 
     Parameters
     ----------
@@ -284,59 +284,58 @@ def sample_points(
         Points of the map [m].
     poses : array, shape (n, 3)
         True poses T_map_radar [m, m, rad].
-    sight : VisiblePoints
-        What these poses see.
+    visible : VisiblePoints
+        Visible cells of these poses.
     front_end : FrontEnd
-        Shares, number of points, errors, reach, and how false points last.
+        Fractions, number of points, errors, range limits, and lifetime of false points.
     rng : numpy.random.Generator
         Source of randomness.
-    parts : array, shape (3,), optional
-        Parts of the three kinds, from `solve_mixture`. Without them they are found at these poses; for a piece of a drive
-        give those of the whole, or a dense place, where false points lie near the map by chance, would get hardly a
-        true one.
+    mixture : array, shape (3,), optional
+        Weights of the three kinds, from `solve_mixture`; computed at these poses if not given. For a segment of a
+        trajectory pass those of the whole one: in a dense place, where false points lie near the map by chance,
+        the segment's own mixture would hold hardly a true point.
 
     Yields
     ------
-    cloud : array, shape (k, 2)
-        Points in the radar frame [m], about ``n_points``; where less of the map is seen than near points are asked
-        for, only what is seen.
+    points : array, shape (k, 2)
+        Points in the radar frame [m], about ``n_points``; fewer where fewer cells are visible than near points are needed.
 
     Raises
     ------
     SampledPointsError
-        If the shares cannot be had on this map, see `solve_mixture`.
+        If no mixture has the fractions on this map, see `solve_mixture`.
     """
-    if parts is None:
-        kinds = measure_fractions(map_points, poses, sight, front_end, rng)
-        parts = solve_mixture(kinds, front_end.share_1m, front_end.share_2m)
-    near, beside, false = (parts * front_end.n_points).round().astype(int)
-    n_kept = round(false * front_end.persistent_share)
+    if mixture is None:
+        kinds = measure_fractions(map_points, poses, visible, front_end, rng)
+        mixture = solve_mixture(kinds, front_end.fraction_1m, front_end.fraction_2m)
+    near, beside, false = (mixture * front_end.n_points).round().astype(int)
+    n_kept = round(false * front_end.persistent_fraction)
     standing, riding, tree = np.zeros((0, 2)), np.zeros((0, 2)), cKDTree(map_points)
     for index, pose in enumerate(poses):
-        seen = sight[index]
+        seen = visible[index]
         standing = _renew(standing, pose, n_kept - n_kept // 2, front_end, rng)
         riding = _renew(riding, np.zeros(3), n_kept // 2, front_end, rng)
         again = np.concatenate([transform_points(invert(pose), standing), riding])
         yield np.concatenate(
             [
-                _draw_near(seen, near, front_end, rng),
-                _draw_beside(seen, beside, pose, tree, rng),
+                _sample_near(seen, near, front_end, rng),
+                _sample_beside(seen, beside, pose, tree, rng),
                 again + rng.normal(0.0, 0.1, again.shape),
-                _draw_anywhere(false - n_kept, front_end, rng),
+                _sample_anywhere(false - n_kept, front_end, rng),
             ]
         )
 
 
-def _draw_near(seen: np.ndarray, n: int, front_end: FrontEnd, rng: np.random.Generator) -> np.ndarray:
-    """Some of the cells seen, each with a small error."""
+def _sample_near(seen: np.ndarray, n: int, front_end: FrontEnd, rng: np.random.Generator) -> np.ndarray:
+    """Some of the visible cells, each with a small error."""
     chosen = rng.permutation(len(seen))[:n]
     return seen[chosen] + rng.normal(0.0, front_end.near_m, (len(chosen), 2))
 
 
-def _draw_beside(
+def _sample_beside(
     seen: np.ndarray, n: int, pose: np.ndarray, tree: cKDTree, rng: np.random.Generator
 ) -> np.ndarray:
-    """Points about cells seen that lie between 1 m and 2 m off the map."""
+    """Points around visible cells, between 1 m and 2 m off the map."""
     if len(seen) == 0:
         return np.zeros((0, 2))
     tried = seen[rng.integers(len(seen), size=12 * n)] + rng.normal(0.0, 2.0, (12 * n, 2))
@@ -344,7 +343,7 @@ def _draw_beside(
     return tried[(away >= 1.0) & (away < 2.0)][:n]
 
 
-def _draw_anywhere(n: int, front_end: FrontEnd, rng: np.random.Generator) -> np.ndarray:
+def _sample_anywhere(n: int, front_end: FrontEnd, rng: np.random.Generator) -> np.ndarray:
     """Points in any direction at any range, as dense along a beam near as far."""
     ranges = rng.uniform(front_end.min_range_m, front_end.max_range_m, n)
     angles = rng.uniform(-np.pi, np.pi, n)
@@ -354,8 +353,8 @@ def _draw_anywhere(n: int, front_end: FrontEnd, rng: np.random.Generator) -> np.
 def _renew(
     points: np.ndarray, T_frame_radar: np.ndarray, n: int, front_end: FrontEnd, rng: np.random.Generator
 ) -> np.ndarray:
-    """Let lasting false points die at random or out of reach, and make up their number with new ones."""
+    """Remove lasting false points at random or out of range, and replace them by new ones."""
     ranges = np.hypot(*(points - T_frame_radar[:2]).T)
     lives = (rng.random(len(points)) < 1.0 - 1.0 / front_end.life_scans) & (ranges < front_end.max_range_m)
-    fresh = _draw_anywhere(n - int(lives.sum()), front_end, rng)
+    fresh = _sample_anywhere(n - int(lives.sum()), front_end, rng)
     return np.concatenate([points[lives], transform_points(T_frame_radar, fresh)])

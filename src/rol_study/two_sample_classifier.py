@@ -1,8 +1,7 @@
-"""The hard test of a simulator: can a classifier tell its scans from real ones?
+"""Compare simulated with real scans by a two-sample classifier.
 
-A small convolutional network looks at patches of 16 azimuths x 64 range bins and says "real" or "simulated". It
-learns on some scans and is judged on others. An area under the curve of 0.5 means that it cannot tell, 1 that
-it always can. `auc_by_group` says where it can.
+A small convolutional network classifies patches of 16 azimuths x 64 range bins as real or simulated. It is evaluated
+on held-out scans. An area under the ROC curve of 0.5 means that the two cannot be separated, 1 that they always can.
 """
 
 from __future__ import annotations
@@ -20,14 +19,14 @@ ROWS, BINS = 16, 64  # size of a patch
 
 @dataclass(frozen=True)
 class ClassifierResult:
-    """What a classifier found on scans that it had not learnt from.
+    """Result of classifiers on held-out scans.
 
     Attributes
     ----------
     auc : float
         Area under the curve over all patches.
     fold_aucs : array, shape (folds,)
-        The same for each group of scans left out.
+        The same for each held-out group of scans.
     scores : array, shape (2, n, 25, 58)
         Score of each patch ("real" is high), of real and of simulated scans, by scan, azimuth and range.
     """
@@ -38,7 +37,7 @@ class ClassifierResult:
 
 
 def cut_patches(codes: np.ndarray) -> np.ndarray:
-    """Cut scans into patches that do not overlap.
+    """Cut scans into non-overlapping patches.
 
     Parameters
     ----------
@@ -48,7 +47,7 @@ def cut_patches(codes: np.ndarray) -> np.ndarray:
     Returns
     -------
     patches : array, shape (n, 25, 58, 16, 64), uint8
-        By scan, azimuth and range; what does not fill a patch at the far end is left out.
+        By scan, azimuth and range; the incomplete patches at the far end are discarded.
     """
     n, rows, bins = len(codes), codes.shape[1] // ROWS, codes.shape[2] // BINS
     cut = codes[:, : rows * ROWS, : bins * BINS].reshape(n, rows, ROWS, bins, BINS)
@@ -56,7 +55,7 @@ def cut_patches(codes: np.ndarray) -> np.ndarray:
 
 
 def area_under_curve(real: np.ndarray, simulated: np.ndarray) -> float:
-    """Give the chance that a real patch scores higher than a simulated one; ties count half.
+    """Compute the area under the ROC curve: the probability that a real patch scores higher; ties count half.
 
     Parameters
     ----------
@@ -66,7 +65,7 @@ def area_under_curve(real: np.ndarray, simulated: np.ndarray) -> float:
     Returns
     -------
     auc : float
-        Between 0 and 1; 0.5 if the scores tell nothing.
+        Between 0 and 1; 0.5 if the scores do not separate the two.
     """
     real, simulated = np.ravel(real), np.ravel(simulated)
     ranks = rankdata(np.concatenate([real, simulated]))[: len(real)]
@@ -82,17 +81,17 @@ def train_classifier(
     epochs: int = 4,
     bf16: bool = False,
 ) -> ClassifierResult:
-    """Train classifiers on some scans and judge them on the others.
+    """Train real-or-simulated classifiers by cross-validation over groups of scans.
 
     Parameters
     ----------
     real, simulated : array, shape (n, 400, 3768), uint8
-        Scans; scan i of the one and scan i of the other are always on the same side of the split, so that a
-        place that both show helps neither.
+        Scans; scan i of both is always on the same side of the split, so that a place that
+        both show helps neither.
     rng : numpy.random.Generator
         Draws first weights and the order of the patches.
     folds : int
-        Groups of neighbouring scans; each is left out once and judged by a network trained on the others.
+        Groups of neighbouring scans; each is held out once and scored by a network trained on the others.
     epochs : int
         Passes over the patches.
     bf16 : bool
@@ -100,7 +99,7 @@ def train_classifier(
 
     Returns
     -------
-    verdict : ClassifierResult
+    result : ClassifierResult
 
     Raises
     ------
@@ -113,31 +112,31 @@ def train_classifier(
         )
     patches = np.stack([cut_patches(real), cut_patches(simulated)])
     scores, aucs = np.empty(patches.shape[:4]), []
-    for left_out in np.array_split(np.arange(len(real)), folds):
-        learnt = np.setdiff1d(np.arange(len(real)), left_out)
-        classifier = _train(patches[:, learnt], rng, epochs, bf16)
-        scores[:, left_out] = _score(classifier, patches[:, left_out], bf16)
-        aucs.append(area_under_curve(*scores[:, left_out]))
+    for held_out in np.array_split(np.arange(len(real)), folds):
+        trained_on = np.setdiff1d(np.arange(len(real)), held_out)
+        classifier = _train(patches[:, trained_on], rng, epochs, bf16)
+        scores[:, held_out] = _score(classifier, patches[:, held_out], bf16)
+        aucs.append(area_under_curve(*scores[:, held_out]))
     return ClassifierResult(area_under_curve(*scores), np.array(aucs), scores)
 
 
 def auc_by_group(
-    verdict: ClassifierResult, real: np.ndarray, simulated: np.ndarray
+    result: ClassifierResult, real: np.ndarray, simulated: np.ndarray
 ) -> dict[str, dict[str, float]]:
-    """Say by what patches the classifier tells the two apart.
+    """Compute the area under the curve for groups of patches.
 
     Parameters
     ----------
-    verdict : ClassifierResult
+    result : ClassifierResult
         From `train_classifier`.
     real, simulated : array, shape (n, 400, 3768), uint8
-        The scans that it was made from.
+        The scans that it was trained and evaluated on.
 
     Returns
     -------
     aucs : dict
         "range": area under the curve of patches by range "low-high" [m]; "brightest": by the brightest code
-        in the patch. 0.5 where it cannot tell.
+        in the patch. 0.5 where the two cannot be separated.
     """
     peaks = np.stack([cut_patches(real), cut_patches(simulated)]).max(axis=(-1, -2))
     range_m = np.broadcast_to((np.arange(peaks.shape[3]) + 0.5) * BINS * MEASURED.resolution_m, peaks.shape)
@@ -151,7 +150,7 @@ def auc_by_group(
         for low, high in pairwise(edges):
             inside = (values >= low) & (values < high)
             if inside[0].any() and inside[1].any():
-                auc = area_under_curve(verdict.scores[0][inside[0]], verdict.scores[1][inside[1]])
+                auc = area_under_curve(result.scores[0][inside[0]], result.scores[1][inside[1]])
                 found[name][f"{low}-{high}"] = auc
     return found
 

@@ -1,15 +1,17 @@
-// Check one page as it stands in the browser: faults as [rule, what], its links, its anchors, and what it holds.
-// Evaluated by test_browser.py, which lists the rules. Contrast, names and headings are checked by axe afterwards.
-async () => {
+// Check the page in the present view: faults as [rule, what], its links, its anchors, and what it holds.
+// test_browser.py evaluates this; `known` lists the combinations of colours and size whose contrast has been checked.
+async (known) => {
+  const isFirstView = !window.wasChecked;
+  window.wasChecked = true;
   const faults = [];
   const fault = (rule, what) => faults.push([rule, String(what).replace(/\s+/g, " ").trim().slice(0, 200)]);
   const all = (selector, root = document) => [...root.querySelectorAll(selector)];
   const pause = (ms) => new Promise((done) => setTimeout(done, ms));
   const shown = (e) => e.checkVisibility({ visibilityProperty: true, opacityProperty: true });
   const show = (e) => e.outerHTML.slice(0, 120);
-  const theme = document.documentElement.dataset.theme || "light";
 
   // ---- wait until the page is at rest -------------------------------------------------------------------------
+  await new Promise(requestAnimationFrame);  // the page may still have to follow a change of the window
   const equations = all(".math");
   if (equations.length && window.MathJax && window.MathJax.startup) await window.MathJax.startup.promise;
   all("img[loading=lazy]").forEach((image) => { image.loading = "eager"; });
@@ -77,6 +79,7 @@ async () => {
     if (box.outerHTML.length > 3e6) fault("animation", `${box.outerHTML.length} bytes`);
     if (!button || !slider) { fault("animation", `no button or no slider: ${show(canvas)}`); continue; }
     if (button.tabIndex < 0 || slider.tabIndex < 0) fault("animation", "cannot be reached by keyboard");
+    if (!isFirstView) continue;
     const before = slider.value;
     button.click();
     for (let i = 0; i < 40 && slider.value === before; i++) await pause(50);
@@ -84,7 +87,7 @@ async () => {
     if (slider.value === before) fault("animation", `does not play: ${show(canvas)}`);
   }
 
-  // ---- links and headings with wrong words, tables -----------------------------------------------------------
+  // ---- names, headings, tables (with axe below) ---------------------------------------------------------------
   for (const e of all("a[href], button, [role=button], summary").filter(shown)) {
     if (/^(here|this|link|click here|this link)\.?$/i.test(e.textContent.trim())) fault("name", `vague: ${show(e)}`);
   }
@@ -110,28 +113,45 @@ async () => {
     fault("width", `reaches to ${Math.round(e.getBoundingClientRect().right)} px: ${show(e)}`);
   }
 
-  // ---- contrast: axe checks the elements marked here, one of each combination of colours and size ---------------
+  // ---- axe: names, headings, and the contrast of the first and last text of each new kind --------
   const grounds = new Map([[null, ""]]), samples = new Map();
   const ground = (e) => {
     if (!grounds.has(e)) {
-      const style = getComputedStyle(e);
-      grounds.set(e, `${ground(e.parentElement)} ${style.backgroundColor} ${style.opacity}`);
+      const { backgroundColor, opacity } = getComputedStyle(e), below = ground(e.parentElement);
+      const own = backgroundColor === "rgba(0, 0, 0, 0)" && opacity === "1" ? "" : `${backgroundColor} ${opacity} `;
+      grounds.set(e, own + below);
     }
     return grounds.get(e);
   };
   for (const e of texts) {
     if (!shown(e) || e.closest(".visually-hidden, [disabled], svg, mjx-assistive-mml")) continue;
     const { color, fontSize, fontWeight } = getComputedStyle(e);
-    samples.set([color, fontSize, fontWeight, ground(e)].join(), e);
+    const kind = [color, fontSize, fontWeight, ground(e)].join(), [first = e] = samples.get(kind) || [];
+    samples.set(kind, [first, e]);
   }
-  samples.forEach((e) => { e.dataset.sample = ""; });
+  known.forEach((kind) => samples.delete(kind));
+  all("[data-sample]").forEach((e) => { delete e.dataset.sample; });
+  [...samples.values()].flat().forEach((e) => { e.dataset.sample = ""; });
+  axe.configure({ rules: [{ id: "color-contrast", selector: "[data-sample]" }] });
+  const rules = {
+    "color-contrast": "contrast", "heading-order": "heading", "role-img-alt": "image", "html-has-lang": "page",
+    "document-title": "page", "link-name": "name", "button-name": "name", "summary-name": "name", "label": "name",
+    "select-name": "name",
+  };
+  // Names and headings do not depend on the view. Without `preload: false` axe itself requests every style sheet.
+  const runOnly = isFirstView ? Object.keys(rules) : samples.size ? ["color-contrast"] : [];
+  const options = { runOnly, resultTypes: ["violations"], preload: false };
+  const found = runOnly.length ? await axe.run(options) : { violations: [] };
+  for (const { id, nodes } of found.violations) {
+    nodes.forEach((node) => fault(rules[id], `${id}: ${node.html.slice(0, 120)} ${node.failureSummary}`));
+  }
 
   // ---- links --------------------------------------------------------------------------------------------------
   const large = all("article img, article canvas").filter((e) => shown(e) && e.getBoundingClientRect().height >= 100);
   const links = all("a[href]").map((e) => [e.href, e.getAttribute("href")]);
   const anchors = ids.concat(all("a[name]").map((e) => e.name));
   return {
-    faults, links, anchors, theme,
+    faults, links, anchors, theme: document.documentElement.dataset.theme || "light", kinds: [...samples.keys()],
     picture: large.length ? Math.round(large[0].getBoundingClientRect().bottom + window.scrollY) : null,
     counts: { equations: equations.length, images: images.length, canvases: all("article canvas").length },
   };

@@ -9,7 +9,8 @@ from __future__ import annotations
 import base64
 import os
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,25 +25,8 @@ from chapters import CHAPTERS
 NAMES = ("chromium", "chromium-browser", "google-chrome")
 OFFLINE = "--host-resolver-rules=MAP * ~NOTFOUND"  # no name is resolved, so nothing leaves the machine
 LOCAL = ("file:", "data:", "blob:", "about:")
-WIDE = {"viewport": {"width": 1280, "height": 900}, "color_scheme": "light"}
-NARROW = {"viewport": {"width": 400, "height": 900}, "color_scheme": "dark"}
 CHECKS = Path(__file__).with_name("page.js").read_text(encoding="utf-8")
-AXE = Axe()
-AXE.axe_script += "; axe.configure({rules: [{id: 'color-contrast', selector: '[data-sample]'}]})"
-AXE_RULES = {
-    "html-has-lang": "page",
-    "document-title": "page",
-    "role-img-alt": "image",
-    "link-name": "name",
-    "button-name": "name",
-    "summary-name": "name",
-    "label": "name",
-    "select-name": "name",
-    "heading-order": "heading",
-    "color-contrast": "contrast",
-}
-# Without `preload: false` axe itself requests every style sheet.
-AXE_OPTIONS = {"runOnly": list(AXE_RULES), "resultTypes": ["violations"], "preload": False}
+AXE = Axe().axe_script
 RULES = {
     "console": "no error and no warning",
     "request": "every file is there, and nothing is asked of a network",
@@ -58,13 +42,26 @@ RULES = {
     "width": "nothing is wider than the window",
     "contrast": "text stands out from its ground, 4.5 to 1, large text 3 to 1",
 }
+BROWSERS = 2  # for the pages of a book, each in its own thread
 FIRST_SCREEN_PX = 800  # height of the window of a small laptop
 NEED_REAL_DATA = ("09_oxford_route", "10_real_radar")  # without it they have no picture
 
 
 @dataclass(frozen=True)
+class View:
+    """How a page is viewed: the width of the window [CSS pixels], the colour scheme, the medium."""
+
+    width: int
+    dark: bool = False
+    medium: str = "screen"
+
+
+WIDE, NARROW = View(1280), View(400, dark=True)
+
+
+@dataclass(frozen=True)
 class Visit:
-    """A page in one view: its address, the view, faults as (rule, words), and what the page holds.
+    """A page in one view: its address, the view, faults as (rule, what), and what the page holds.
 
     ``links`` are pairs of the whole address and the attribute, ``anchors`` the names that can be linked to, ``counts``
     the numbers of equations, images and canvases; ``theme`` is "light" or "dark"; ``picture`` is the lower edge of the
@@ -72,7 +69,7 @@ class Visit:
     """
 
     address: str
-    view: dict
+    view: View
     faults: list[tuple[str, str]]
     links: list[tuple[str, str]]
     anchors: list[str]
@@ -82,18 +79,16 @@ class Visit:
 
 
 class Tab:
-    """A tab of the browser in one view, with the faults that it has reported since its page was opened."""
+    """A tab that opens one page after the other and records what a page reports."""
 
-    def __init__(self, browser: Browser, view: dict) -> None:
-        self.view, self.page = view, browser.new_page(**view)
+    def __init__(self, browser: Browser) -> None:
+        self.page = browser.new_page()
+        self.page.add_init_script(AXE)
         self._faults: list[tuple[str, str]] = []
         self.page.on("console", self._on_console)
         self.page.on("pageerror", lambda error: self._faults.append(("console", str(error))))
         self.page.on("request", self._on_request)
-        self.page.on(
-            "requestfailed",
-            lambda request: self._faults.append(("request", f"{request.failure}: {request.url}")),
-        )
+        self.page.on("requestfailed", lambda it: self._faults.append(("request", f"{it.failure}: {it.url}")))
 
     def _on_console(self, message: ConsoleMessage) -> None:
         if message.type in ("error", "warning", "assert"):
@@ -103,17 +98,32 @@ class Tab:
         if not request.url.startswith(LOCAL):
             self._faults.append(("request", f"asks the network: {request.url}"))
 
-    def visit(self, address: str) -> Visit:
-        """Open a page, wait until it is at rest, and check it by every rule."""
+    def look(self, view: View) -> None:
+        """Set the size of the window, the preferred colour scheme, and the medium."""
+        self.page.set_viewport_size({"width": view.width, "height": 900})
+        self.page.emulate_media(color_scheme="dark" if view.dark else "light", media=view.medium)
+
+    def open(self, address: str, view: View) -> None:
+        """Load a page until its load event."""
         self._faults.clear()
+        self.look(view)
         self.page.goto(address)
-        seen = self.page.evaluate(CHECKS)
-        faults = [(rule, words) for rule, words in seen.pop("faults")]
-        for violation in AXE.run(self.page, options=AXE_OPTIONS).response["violations"]:
-            for node in violation["nodes"]:
-                words = f"{violation['id']}: {node['failureSummary']} {node['html']}"
-                faults.append((AXE_RULES[violation["id"]], " ".join(words.split())[:400]))
-        return Visit(address, self.view, [*self._faults, *faults], **seen)
+
+    def visit(self, address: str, views: Sequence[View], known: set[str] | None = None) -> list[Visit]:
+        """Open a page in the first view, switch to the others without loading it again, and check it in each.
+
+        ``known`` are combinations of colours and size whose contrast has been checked; those of this page are added.
+        """
+        self.open(address, views[0])
+        visits, known = [], set() if known is None else known
+        for view in views:
+            self.look(view)
+            seen = self.page.evaluate(CHECKS, list(known))
+            known.update(seen.pop("kinds"))
+            faults = [*self._faults, *((rule, what) for rule, what in seen.pop("faults"))]
+            self._faults.clear()
+            visits.append(Visit(address, view, faults, **seen))
+        return visits
 
 
 def find_chromium() -> str | None:
@@ -123,33 +133,29 @@ def find_chromium() -> str | None:
 
 
 @contextmanager
-def launch(executable: str) -> Iterator[Browser]:
-    """Start a browser that resolves no name."""
+def launch(executable: str) -> Iterator[Tab]:
+    """Start a browser that resolves no name, with one tab."""
     with sync_playwright() as playwright:
-        yield playwright.chromium.launch(executable_path=executable, args=[OFFLINE])
+        yield Tab(playwright.chromium.launch(executable_path=executable, args=[OFFLINE]))
 
 
 @pytest.fixture(scope="module")
-def chromium() -> Iterator[Browser]:
-    """One browser for all tests of this file; without one they skip.
-
-    It ends with the file: until then an event loop runs in this thread, which the tests of other files may not expect.
-    """
-    executable = find_chromium()
-    if executable is None:
+def executable() -> str:
+    """The browser; without one the tests skip."""
+    found = find_chromium()
+    if found is None:
         pytest.skip("no Chromium: install `chromium`, or name one in the environment variable ROL_CHROMIUM")
-    with launch(executable) as browser:
-        yield browser
+    return found
 
 
 @pytest.fixture(scope="module")
-def wide(chromium: Browser) -> Tab:
-    return Tab(chromium, WIDE)
+def tab(executable: str) -> Iterator[Tab]:
+    """One browser for the tests of this file.
 
-
-@pytest.fixture(scope="module")
-def narrow(chromium: Browser) -> Tab:
-    return Tab(chromium, NARROW)
+    It ends with the file: until then this thread has a running event loop, in which other tests cannot start theirs.
+    """
+    with launch(executable) as opened:
+        yield opened
 
 
 @pytest.fixture
@@ -170,14 +176,29 @@ def surveys() -> dict[Path, list[Visit]]:
 
 
 @pytest.fixture
-def visits(html: Path, wide: Tab, narrow: Tab, surveys: dict[Path, list[Visit]]) -> list[Visit]:
+def visits(html: Path, executable: str, surveys: dict[Path, list[Visit]]) -> list[Visit]:
     if html not in surveys:
-        surveys[html] = [tab.visit(page.as_uri()) for page in pages_of(html) for tab in (wide, narrow)]
+        addresses = [page.as_uri() for page in pages_of(html)]
+        shares = [addresses[k::BROWSERS] for k in range(BROWSERS)]
+        with ThreadPoolExecutor(BROWSERS) as pool:
+            visits = pool.map(survey, [executable] * BROWSERS, shares)
+            surveys[html] = [visit for share in visits for visit in share]
     return surveys[html]
 
 
+def survey(executable: str, addresses: list[str]) -> list[Visit]:
+    """Visit pages in a browser of their own; every second one is loaded narrow and dark, then made wide and light."""
+    known: set[str] = set()
+    with launch(executable) as tab:
+        return [
+            visit
+            for k, address in enumerate(addresses)
+            for visit in tab.visit(address, (WIDE, NARROW)[:: (-1) ** k], known)
+        ]
+
+
 def told(visit: Visit) -> str:
-    return f"{'/'.join(urlsplit(visit.address).path.split('/')[-2:])} at {visit.view['viewport']['width']} px"
+    return f"{'/'.join(urlsplit(visit.address).path.split('/')[-2:])} at {visit.view.width} px"
 
 
 def broken_links(visits: list[Visit]) -> list[str]:
@@ -236,32 +257,31 @@ def test_every_link_leads_somewhere(visits: list[Visit]) -> None:
 
 
 def test_pages_are_dark_for_whom_prefers_it(visits: list[Visit]) -> None:
-    assert all(visit.theme == ("dark" if visit.view is NARROW else "light") for visit in visits)
+    assert all(visit.theme == ("dark" if visit.view.dark else "light") for visit in visits)
 
 
-def test_search_finds_pages_without_a_network(html: Path, wide: Tab, narrow: Tab) -> None:
-    assert not wide.visit((html / "search.html").as_uri() + "?q=particle").faults
-    found = wide.page.locator("#search-results li a[href*='07_localization']").first
-    address = found.evaluate("(link) => link.href")
-    assert not [words for rule, words in narrow.visit(address).faults if rule in ("console", "request")]
+def test_search_finds_pages_without_a_network(html: Path, tab: Tab) -> None:
+    [search] = tab.visit((html / "search.html").as_uri() + "?q=particle", [WIDE])
+    assert not search.faults
+    address = tab.page.locator("#search-results a[href*='07_localization']").first.evaluate("(a) => a.href")
+    [found] = tab.visit(address, [NARROW])
+    assert not [what for rule, what in found.faults if rule in ("console", "request")]
 
 
-def test_first_file_leads_to_the_first_page(html: Path, wide: Tab) -> None:
-    wide.page.goto((html / "index.html").as_uri())
-    wide.page.wait_for_url((html / "intro.html").as_uri())
+def test_first_file_leads_to_the_first_page(html: Path, tab: Tab) -> None:
+    tab.open((html / "index.html").as_uri(), WIDE)
+    tab.page.wait_for_url((html / "intro.html").as_uri())
 
 
-def test_print_is_black_on_white_and_has_no_controls(html: Path, chromium: Browser) -> None:
-    address = next(p for p in pages_of(html) if "<canvas" in p.read_text(encoding="utf-8")).as_uri()
-    with chromium.new_page(viewport={"width": 800, "height": 900}, color_scheme="dark") as page:
-        page.emulate_media(media="print")
-        page.goto(address)
-        assert page.evaluate("document.documentElement.dataset.theme") == "dark"
-        assert page.evaluate("getComputedStyle(document.querySelector('article p')).color") == "rgb(0, 0, 0)"
-        assert page.evaluate("getComputedStyle(document.body).backgroundColor") == "rgb(255, 255, 255)"
-        controls = page.locator(".bd-sidebar-primary, .bd-header-article, article button, article input")
-        assert controls.count() and not controls.filter(visible=True).count()
-        assert page.evaluate("document.documentElement.scrollWidth") <= 800
+def test_print_is_black_on_white_and_has_no_controls(html: Path, tab: Tab) -> None:
+    printed = next(page for page in pages_of(html) if "<canvas" in page.read_text(encoding="utf-8"))
+    tab.open(printed.as_uri(), View(800, dark=True, medium="print"))
+    assert tab.page.evaluate("document.documentElement.dataset.theme") == "dark"
+    assert tab.page.evaluate("getComputedStyle(document.querySelector('article p')).color") == "rgb(0, 0, 0)"
+    assert tab.page.evaluate("getComputedStyle(document.body).backgroundColor") == "rgb(255, 255, 255)"
+    controls = tab.page.locator(".bd-sidebar-primary, .bd-header-article, article button, article input")
+    assert controls.count() and not controls.filter(visible=True).count()
+    assert tab.page.evaluate("document.documentElement.scrollWidth") <= 800
 
 
 # ---- the checker ----------------------------------------------------------------------------------------------
@@ -338,35 +358,51 @@ def small_page(folder: Path, article: str = "", page: str = GOOD) -> str:
 @pytest.mark.parametrize(
     "article", ["", PLAYS, "<div style='overflow: auto'><p style='width: 1500px'>wide</p></div>"]
 )
-def test_good_page_has_no_fault(tmp_path: Path, narrow: Tab, article: str) -> None:
-    visit = narrow.visit(small_page(tmp_path, article))
+def test_good_page_has_no_fault(tmp_path: Path, tab: Tab, article: str) -> None:
+    [visit] = tab.visit(small_page(tmp_path, article), [NARROW])
     assert not visit.faults and not broken_links([visit])
 
 
 @pytest.mark.parametrize(
     ("rule", "article", "words"), BAD, ids=[f"{k}-{bad[0]}" for k, bad in enumerate(BAD)]
 )
-def test_rule_bites(tmp_path: Path, narrow: Tab, rule: str, article: str, words: str) -> None:
-    faults = narrow.visit(small_page(tmp_path, article)).faults
+def test_rule_bites(tmp_path: Path, tab: Tab, rule: str, article: str, words: str) -> None:
+    faults = tab.visit(small_page(tmp_path, article), [NARROW])[0].faults
     assert any(name == rule and words in what for name, what in faults), faults
 
 
 @pytest.mark.parametrize(("before", "ends"), [("", 0), ("<div style='height: 2000px'>words</div>", 2000)])
-def test_place_of_the_first_picture_is_told(tmp_path: Path, wide: Tab, before: str, ends: int) -> None:
+def test_place_of_the_first_picture_is_told(tmp_path: Path, tab: Tab, before: str, ends: int) -> None:
     picture = "<img src='dot.png' alt='A dot' style='display: block; height: 300px'>"
-    visit = wide.visit(small_page(tmp_path, before + picture))
+    [visit] = tab.visit(small_page(tmp_path, before + picture), [WIDE])
     assert ends + 300 < visit.picture < ends + 500
-    assert wide.visit(small_page(tmp_path)).picture is None  # a dot is no picture
+    assert tab.visit(small_page(tmp_path), [WIDE])[0].picture is None  # a dot is no picture
 
 
 @pytest.mark.parametrize(
     ("gone", "words"),
     [(' lang="en"', "html-has-lang"), ("A page</title>", "document-title"), ('rel="icon"', "no icon")],
 )
-def test_rule_of_the_page_bites(tmp_path: Path, narrow: Tab, gone: str, words: str) -> None:
+def test_rule_of_the_page_bites(tmp_path: Path, tab: Tab, gone: str, words: str) -> None:
     page = GOOD.replace(gone, "</title>" if "title" in gone else "")
-    faults = narrow.visit(small_page(tmp_path, page=page)).faults
+    faults = tab.visit(small_page(tmp_path, page=page), [NARROW])[0].faults
     assert any(rule == "page" and words in what for rule, what in faults), faults
+
+
+@pytest.mark.parametrize("views", [(WIDE, NARROW), (NARROW, WIDE)])
+def test_fault_of_one_view_is_found_there(tmp_path: Path, tab: Tab, views: tuple[View, View]) -> None:
+    article = "<style>@media (prefers-color-scheme: dark) { h1 { color: #ccc } }</style><p style='width: 700px'>wide</p>"
+    visits = tab.visit(small_page(tmp_path, article), views)
+    assert {view: {rule for rule, _ in visit.faults} for view, visit in zip(views, visits, strict=True)} == {
+        WIDE: set(),
+        NARROW: {"contrast", "width"},
+    }
+
+
+def test_colours_that_were_checked_are_not_checked_again(tmp_path: Path, tab: Tab) -> None:
+    known: set[str] = set()
+    page = small_page(tmp_path, "<p style='color: #999'>pale</p>")
+    assert [len(tab.visit(page, [WIDE], known)[0].faults) for _ in range(2)] == [1, 0]
 
 
 def test_every_rule_is_seen_to_bite() -> None:
@@ -374,14 +410,22 @@ def test_every_rule_is_seen_to_bite() -> None:
 
 
 @pytest.mark.parametrize("target", ["nowhere.html", "#nowhere", "page.html#nowhere", "dot.html?q=1"])
-def test_broken_link_is_found(tmp_path: Path, wide: Tab, target: str) -> None:
-    visit = wide.visit(small_page(tmp_path, f"<a href='{target}'>There it is</a>"))
+def test_broken_link_is_found(tmp_path: Path, tab: Tab, target: str) -> None:
+    [visit] = tab.visit(small_page(tmp_path, f"<a href='{target}'>There it is</a>"), [WIDE])
     assert [line.rpartition(": ")[2] for line in broken_links([visit])] == [target]
 
 
-def test_page_that_is_not_there_is_an_error(tmp_path: Path, wide: Tab) -> None:
+def test_page_that_is_not_there_is_an_error(tmp_path: Path, tab: Tab) -> None:
     with pytest.raises(Error, match="nowhere"):
-        wide.visit((tmp_path / "nowhere.html").as_uri())
+        tab.open((tmp_path / "nowhere.html").as_uri(), WIDE)
+
+
+def test_browser_that_does_not_start_says_so(tmp_path: Path) -> None:
+    program = tmp_path / "broken"
+    program.write_text("#!/bin/sh\necho no display today\n", encoding="utf-8")
+    program.chmod(0o755)
+    with ThreadPoolExecutor() as pool, pytest.raises(Error, match="no display today"):
+        pool.submit(survey, str(program), []).result()
 
 
 def test_browser_is_found_by_the_environment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -35,7 +35,7 @@ PACKAGES = {
 }  # fmt: skip
 
 # Modules that may import torch; no module of `rol` may import open3d or matplotlib.
-WITH_TORCH = {"pix2pix", "training"}
+WITH_TORCH = {"pipeline", "pix2pix", "training"}
 END = "----- end of an example -----\n"
 
 

@@ -137,7 +137,7 @@ def test_the_classes_are_all_there() -> None:
         (TrainConfig, {"beta1": 1.0}, Pix2PixError, "beta1: 1.0 is not in"),
         (TrainConfig, {"network": "vnet"}, Pix2PixError, "network: 'vnet' is none of resnet, unet"),
         (TrainConfig, {"pixel_loss": "l2"}, Pix2PixError, "pixel_loss: 'l2' is none of l1, entropy"),
-        (FrontEnd, {"share_1m": 40.0}, SampledPointsError, "share_1m: 40.0 is not in"),
+        (FrontEnd, {"fraction_1m": 40.0}, SampledPointsError, "fraction_1m: 40.0 is not in"),
         (RadarSettings, {"layer_widths_deg": (0.8, 0.0)}, ValueError, "layer_widths_deg: .* is not in"),
         (SimulationSettings, {"loop_m": 10.0}, SettingsError, r"loop_m: 10.0 is not in \[450, inf\)"),
         (SessionSettings, {"changed_share": 0.4}, SettingsError, r"changed_share: 0.4 is not in \[0, 0.3\]"),

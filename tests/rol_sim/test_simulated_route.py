@@ -122,7 +122,7 @@ def test_a_week_changes_a_stated_share_and_leaves_the_walls() -> None:
     lonely = rng.uniform(-2000.0, 2000.0, (3000, 2))
     wall = np.column_stack([np.arange(0.0, 500.0, 0.25), np.full(2000, 5000.0)])
     cells = mapped.classify_cells(np.concatenate([lonely, wall]))
-    later = mapped.change_cells(cells, np.random.default_rng(3), missing_share=0.2)
+    later = mapped.change_cells(cells, np.random.default_rng(3), missing_fraction=0.2)
     is_row, was_row = later.kinds <= mapped.Kind.WALL, cells.kinds <= mapped.Kind.WALL
     assert 1.0 - (~is_row).sum() / (~was_row).sum() == pytest.approx(0.2, abs=0.03)
     assert 1.0 - is_row.sum() / was_row.sum() == pytest.approx(0.04, abs=0.02)
@@ -130,7 +130,7 @@ def test_a_week_changes_a_stated_share_and_leaves_the_walls() -> None:
 
 def test_what_the_map_does_not_show_is_the_same_on_all_days() -> None:
     cells = mapped.classify_cells(np.random.default_rng(0).uniform(-500.0, 500.0, (3000, 2)))
-    drawn = mapped.draw_unmapped(cells, np.random.default_rng(4), share=0.5)
+    drawn = mapped.draw_unmapped(cells, np.random.default_rng(4), fraction=0.5)
     assert len(np.unique(drawn.groups)) / len(np.unique(cells.groups)) == pytest.approx(0.5, abs=0.01)
     assert drawn.groups.min() > cells.groups.max()
     kept = mapped.crop_cells(drawn, np.zeros((1, 2)), 300.0, clear_m=40.0)
@@ -175,7 +175,7 @@ def test_nobody_stands_or_drives_in_the_way() -> None:
     trajectory, rng = recorded_poses.interpolate_trajectory(stamps, poses), np.random.default_rng(2)
     taken = np.column_stack(
         [np.arange(0.0, 400.0, 0.5), np.full(800, 2.4)]
-    )  # no room at the first kerb there
+    )  # the first kerb is not free there
     parked = recorded_poses.park_vehicles(trajectory, taken, rng, parked_share=1.0, first_object=50)
     x, y = parked.vertices[:, 0], parked.vertices[:, 1]
     assert np.abs(y).min() > 1.1 and not ((y > 0.0) & (x > 5.0) & (x < 395.0)).any()
@@ -261,7 +261,7 @@ def test_a_disk_without_room_is_told_before_anything_is_written(
 ) -> None:
     usage = shutil.disk_usage(tmp_path)
     monkeypatch.setattr(writer.shutil, "disk_usage", lambda path: usage._replace(free=1_000_000))
-    with pytest.raises(OSError, match=r"not enough room: 4 scans and 0 sweeps, .* 0.0 GB are free"):
+    with pytest.raises(OSError, match=r"not enough disk space: 4 scans and 0 sweeps, .* 0.0 GB are free"):
         writer.write_session(load_settings(recipe(tmp_path, small_root)), NAME, tmp_path)
     assert not list((tmp_path / NAME / "radar").iterdir())
 

@@ -15,8 +15,9 @@ from rol.evaluation import read_tum
 from rol.geometry import accumulate_increments, compose, invert, transform_points
 from rol_sim.__main__ import main
 from rol_sim.session import logs, writer
+from rol_sim.session.labels import label_sweep, list_labels
 from rol_sim.session.settings import SettingsError, load_settings, parse_settings, read_settings
-from rol_sim.session.simulation import build_session, label_sweep, list_labels
+from rol_sim.session.simulation import build_session
 from rol_sim.world.mesh import GROUND_MATERIALS, Material
 
 pytestmark = pytest.mark.open3d

@@ -339,7 +339,7 @@ def test_nobody_drives_through_the_car(town: world.Town, trajectory) -> None:
 
 # ---- the lidar ----
 
-CLEAN = LidarSettings(range_noise_m=0.0, lost_share=0.0)
+CLEAN = LidarSettings(range_noise_m=0.0, lost_fraction=0.0)
 
 
 def room() -> Scene:
@@ -426,7 +426,7 @@ def test_what_a_lidar_loses() -> None:
 
     assert (level_ranges(Material.FACADE, 101.0, CLEAN) == 0).all()
     np.testing.assert_allclose(level_ranges(Material.FACADE, 50.0, CLEAN)[0], 50.0, atol=0.002)
-    noisy = level_ranges(Material.FACADE, 30.0, LidarSettings(range_noise_m=0.02, lost_share=0.0))
+    noisy = level_ranges(Material.FACADE, 30.0, LidarSettings(range_noise_m=0.02, lost_fraction=0.0))
     true = level_ranges(Material.FACADE, 30.0, CLEAN)
     kept = (noisy > 0) & (true > 0)
     assert 0.012 < np.std(noisy[kept] - true[kept]) < 0.03

@@ -61,9 +61,10 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
     return given
 
 
-def test_clouds_lie_on_the_map_at_their_poses(small_root: Path, asked: list[Any]) -> None:
+def test_points_lie_on_the_map_at_their_poses(small_root: Path, asked: list[Any]) -> None:
     tree = cKDTree(rall.load_map_points(small_root / rall.MAP_PATH))
-    clouds = render_points(small_root, "02", 4, 5, NOBODY, 3, bf16=True, tta_rotations=2, **QUIET)
+    session = build_segment(small_root, "02", 4, 5, 3, **QUIET)
+    clouds = render_points(session, NOBODY, bf16=True, tta_rotations=2)
     assert isinstance(clouds, Iterator) and not asked  # nothing is rendered before it is asked for
     poses = drive_poses()[4:9]
     right, wrong = ([], [])
@@ -79,9 +80,10 @@ def test_clouds_lie_on_the_map_at_their_poses(small_root: Path, asked: list[Any]
     np.testing.assert_allclose(speeds[:, 2], 0.04, atol=0.01)
 
 
-def test_a_seed_gives_the_same_clouds_one_scan_at_a_time(small_root: Path, asked: list[Any]) -> None:
+def test_a_seed_gives_the_same_points_one_scan_at_a_time(small_root: Path, asked: list[Any]) -> None:
     def take(number: str, seed: int) -> list[np.ndarray]:
-        return list(itertools.islice(render_points(small_root, number, 0, 12, NOBODY, seed), 2))
+        session = build_segment(small_root, number, 0, 12, seed)
+        return list(itertools.islice(render_points(session, NOBODY), 2))
 
     one, again, other, day = take("02", 3), take("02", 3), take("02", 4), take("07", 3)
     assert len(asked) == 8  # two of twelve each time
@@ -116,14 +118,14 @@ def test_scans_that_are_not_there_are_refused_at_once(
     small_root: Path, number: str, first: int, n: int, fault: str
 ) -> None:
     with pytest.raises(ValueError, match=fault):
-        render_points(small_root, number, first, n, NOBODY, 3)
+        build_segment(small_root, number, first, n, 3)
 
 
 def test_other_faults_are_named(small_root: Path, tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="no real data in"):
-        render_points(tmp_path, "02", 0, 3, NOBODY, 3)
+        build_segment(tmp_path, "02", 0, 3, 3)
     with pytest.raises(ValueError, match="unknown key 'clouds'"):
-        render_points(small_root, "02", 0, 3, NOBODY, 3, clouds=1)
+        build_segment(small_root, "02", 0, 3, 3, clouds=1)
 
 
 @pytest.mark.torch
@@ -135,6 +137,6 @@ def test_an_untrained_network_on_the_real_route(real_root: Path) -> None:
     generator = build_generator(2, 1, rng=torch.Generator().manual_seed(1))
     generator.image_size = (512, 512)
     network = TrainedNetwork(generator, {"threshold": 1}, {}, {})
-    clouds = list(render_points(real_root, "02", 6000, 3, network, 3))
+    clouds = list(render_points(build_segment(real_root, "02", 6000, 3, 3), network))
     assert len(clouds) == 3 and all(len(cloud) > 100 for cloud in clouds)
     assert max(np.abs(cloud).max() for cloud in clouds) < 64.0 * np.sqrt(2.0)

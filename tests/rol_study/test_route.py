@@ -101,7 +101,7 @@ def test_the_published_contrast_is_that_of_session_01(real_root: Path) -> None:
     for front_end in (FrontEnd(), FrontEnd(0.50, 0.70), FrontEnd(0.65, 0.80), FrontEnd(0.80, 0.90)):
         taught = prepare_experiment(real_root, "02", front_end, max_scans=3)
         assert taught.calibration_session == "01"
-        assert published_reference_contrast(front_end.share_1m) == pytest.approx(
+        assert published_reference_contrast(front_end.fraction_1m) == pytest.approx(
             taught.reference_contrast, abs=0.003
         )
     assert 0.048 < published_reference_contrast(0.45) < 0.1 and published_reference_contrast(

@@ -1,4 +1,4 @@
-"""Points of stated quality drawn from a map: what is seen, how kinds are mixed, and the shares that come out."""
+"""Points of given precision sampled from a map: visible cells, mixture of kinds, resulting fractions."""
 
 import numpy as np
 import pytest
@@ -21,49 +21,49 @@ STREETS = np.concatenate([WALL, WALL - (25.0, 0.0), np.random.default_rng(0).uni
 def test_a_beam_is_spent_after_so_many_surfaces() -> None:
     pose = np.array([[0.0, 0.0, 0.0]])
     for n_surfaces, seen in ((1, {10}), (2, {10, 15}), (3, {10, 15, 20})):
-        sight = find_visible_points(np.concatenate([WALL, SECOND, THIRD]), pose, n_surfaces=n_surfaces)
-        assert set(np.floor(sight[0][:, 0]).astype(int)) == seen
+        visible = find_visible_points(np.concatenate([WALL, SECOND, THIRD]), pose, n_surfaces=n_surfaces)
+        assert set(np.floor(visible[0][:, 0]).astype(int)) == seen
 
 
 def test_what_is_seen_is_in_the_frame_of_the_radar_and_within_its_reach() -> None:
     pose = np.array([[3.0, 4.0, np.pi / 2.0]])  # looks along the wall, which is to its right
-    sight = find_visible_points(WALL, pose, max_range_m=15.0)
-    placed = transform_points(pose[0], sight[0])
-    assert np.abs(placed[:, 0] - 10.125).max() < 0.02 and np.hypot(*sight[0].T).max() < 15.3
-    assert (sight[0][:, 1] < 0).all() and len(np.unique(sight.points, axis=0)) == len(sight.points)
+    visible = find_visible_points(WALL, pose, max_range_m=15.0)
+    placed = transform_points(pose[0], visible[0])
+    assert np.abs(placed[:, 0] - 10.125).max() < 0.02 and np.hypot(*visible[0].T).max() < 15.3
+    assert (visible[0][:, 1] < 0).all() and len(np.unique(visible.points, axis=0)) == len(visible.points)
     nothing = find_visible_points(WALL, np.array([[500.0, 0.0, 0.0], *pose]))
     assert len(nothing) == 2 and len(nothing[0]) == 0 and len(nothing[1]) > 50
 
 
-def test_kinds_are_mixed_so_that_the_shares_come_out() -> None:
-    shares = np.array([[1.0, 0.0, 0.3], [1.0, 1.0, 0.5]])
-    parts = solve_mixture(shares, 0.4, 0.6)
+def test_mixture_has_the_given_fractions() -> None:
+    fractions = np.array([[1.0, 0.0, 0.3], [1.0, 1.0, 0.5]])
+    mixture = solve_mixture(fractions, 0.4, 0.6)
     # 0.16 + 0.3 * 0.8 = 0.4, and 0.16 + 0.04 + 0.5 * 0.8 = 0.6
-    np.testing.assert_allclose(parts, [0.16, 0.04, 0.8])
+    np.testing.assert_allclose(mixture, [0.16, 0.04, 0.8])
     with pytest.raises(
         SampledPointsError, match="0.10 within 1 m and 0.20 within 2 m here: it would need near -0"
     ):
-        solve_mixture(shares, 0.1, 0.2)
+        solve_mixture(fractions, 0.1, 0.2)
 
 
-@pytest.mark.parametrize(("share_1m", "share_2m"), [(0.4, 0.6), (0.8, 0.9)])
-def test_clouds_have_the_shares_asked_for(share_1m: float, share_2m: float) -> None:
+@pytest.mark.parametrize(("fraction_1m", "fraction_2m"), [(0.4, 0.6), (0.8, 0.9)])
+def test_sampled_points_have_the_given_fractions(fraction_1m: float, fraction_2m: float) -> None:
     poses = np.column_stack([np.linspace(-5, 5, 40), np.zeros(40), np.linspace(0, 1, 40)])
-    front_end = FrontEnd(share_1m, share_2m, n_points=300)
-    sight, rng = find_visible_points(STREETS, poses), np.random.default_rng(1)
-    clouds = list(sample_points(STREETS, poses, sight, front_end, rng))
+    front_end = FrontEnd(fraction_1m, fraction_2m, n_points=300)
+    visible, rng = find_visible_points(STREETS, poses), np.random.default_rng(1)
+    clouds = list(sample_points(STREETS, poses, visible, front_end, rng))
     tree = cKDTree(STREETS)
     away = [tree.query(transform_points(p, c))[0] for p, c in zip(poses, clouds, strict=True)]
-    shares = [[np.mean(d < radius) for d in away] for radius in (1.0, 2.0)]
-    np.testing.assert_allclose(np.mean(shares, axis=1), [share_1m, share_2m], atol=0.04)
+    fractions = [[np.mean(d < radius) for d in away] for radius in (1.0, 2.0)]
+    np.testing.assert_allclose(np.mean(fractions, axis=1), [fraction_1m, fraction_2m], atol=0.04)
     assert np.abs([len(c) for c in clouds] - np.float64(300)).max() < 60
 
 
 def test_same_seed_same_clouds() -> None:
     poses = np.zeros((3, 3))
-    sight = find_visible_points(STREETS, poses)
+    visible = find_visible_points(STREETS, poses)
     first, again = (
-        list(sample_points(STREETS, poses, sight, FrontEnd(), np.random.default_rng(5))) for _ in range(2)
+        list(sample_points(STREETS, poses, visible, FrontEnd(), np.random.default_rng(5))) for _ in range(2)
     )
     for a, b in zip(first, again, strict=True):
         np.testing.assert_array_equal(a, b)
@@ -71,7 +71,7 @@ def test_same_seed_same_clouds() -> None:
 
 def test_false_points_last_as_long_as_stated() -> None:
     poses, far = np.zeros((200, 3)), np.array([[300.0, 0.0], [300.0, 60.0]])
-    front_end = FrontEnd(n_points=200, persistent_share=1.0, life_scans=5.0)
+    front_end = FrontEnd(n_points=200, persistent_fraction=1.0, life_scans=5.0)
     from rol_study.sampled_points import _renew
 
     rng, points, stayed = np.random.default_rng(6), np.zeros((0, 2)), []

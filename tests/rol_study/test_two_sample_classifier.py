@@ -1,4 +1,4 @@
-"""How real and simulated scans are held against each other: statistics of motion and map, and the classifier."""
+"""Comparison of real and simulated scans: statistics of motion and map, and the two-sample classifier."""
 
 from pathlib import Path
 
@@ -50,7 +50,7 @@ def test_doppler_shift_and_motion_are_found_from_scans_alone(doppler: float) -> 
     assert found["correlation_motion"] < found["correlation_both"] - 0.01
 
 
-def test_map_shares_count_peaks_near_the_map() -> None:
+def test_map_fractions_count_peaks_near_the_map() -> None:
     scans, poses = moving_scans(0.0)
     rng = np.random.default_rng(5)
     points = rng.uniform(-60.0, 60.0, (160, 2))
@@ -109,8 +109,8 @@ def test_twins_have_the_statistics_of_the_real_scans(real_root: Path) -> None:
     ours, theirs = statistics.scan_statistics(codes), statistics.scan_statistics(real)
     assert ours["forbidden"] == 0 and ours["near_copies"]
     assert statistics.hellinger_distance(ours["histogram"], theirs["histogram"]) < 0.1
-    for code, share in theirs["shares"].items():
-        assert 1.0 / 1.5 < ours["shares"][code] / share < 1.5, code
+    for code, share in theirs["fractions"].items():
+        assert 1.0 / 1.5 < ours["fractions"][code] / share < 1.5, code
     for range_m, share in theirs["zero_fractions"].items():
         assert abs(ours["zero_fractions"][range_m] - share) < 0.05, range_m
     np.testing.assert_allclose(ours["range_correlation"], theirs["range_correlation"], atol=0.05)

@@ -71,7 +71,7 @@ def test_no_file_names_a_path_of_a_machine() -> None:
 
 
 @pytest.mark.parametrize("profile", PROFILES, ids=lambda path: path.stem)
-def test_profile_is_whole_and_its_knobs_are_parameters(profile: Path) -> None:
+def test_profile_is_complete_and_names_parameters_of_the_notebooks(profile: Path) -> None:
     config = chapters.load_config(profile)
     assert config["profile"] == profile.stem
     for run in chapters.all_runs(config):
@@ -452,11 +452,11 @@ def test_missing_real_session_is_named(workplace: Path) -> None:
     assert "2019-01-10-11-46-21-radar-oxford-10k/radar.timestamps is missing" in answer.stdout + answer.stderr
 
 
-def test_unknown_knob_ends_before_anything_runs(workplace: Path) -> None:
+def test_unknown_parameter_ends_before_anything_runs(workplace: Path) -> None:
     config = chapters.load_config(ROOT / "config/smoke.yaml") | {
-        "notebooks": {"08_results": {"no_such_knob": 1}}
+        "notebooks": {"08_results": {"no_such_parameter": 1}}
     }
     (workplace / "mine.yaml").write_text(yaml.safe_dump(config), encoding="utf-8")
     answer = snakemake(workplace, "-n", "--configfile", "mine.yaml")
     assert answer.returncode != 0
-    assert "has no parameter no_such_knob" in answer.stdout + answer.stderr
+    assert "has no parameter no_such_parameter" in answer.stdout + answer.stderr

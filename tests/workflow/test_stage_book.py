@@ -244,6 +244,13 @@ def test_finished_pages_are_cleaned(quiet_pages: ModuleType, tmp_path: Path) -> 
     assert (tmp_path / "search.html").read_text(encoding="utf-8") == twice
 
 
+def test_default_that_is_made_anew_is_shown_as_dots(quiet_pages: ModuleType) -> None:
+    words = ("class", "rol.x.X", None, {})
+    shown = quiet_pages.readable_defaults(None, *words, "(a: list = <factory>, b: int = 1)", "X")
+    assert shown == ("(a: list = ..., b: int = 1)", "X")
+    assert quiet_pages.readable_defaults(None, *words, None, None) == (None, None)
+
+
 # ---- links and the first picture ------------------------------------------------------------------------------
 
 

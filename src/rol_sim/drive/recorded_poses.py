@@ -1,4 +1,4 @@
-"""A trajectory along given poses, and who is met on the way: parked, oncoming, leading and following vehicles.
+"""A trajectory along given poses, and traffic along it: parked, oncoming, leading and following vehicles.
 
 The poses are those of a real session, 4 a second; between them the car moves smoothly. World frame: that of
 the poses (x, y, yaw) [m, m, rad].
@@ -59,8 +59,8 @@ def interpolate_trajectory(stamps_us: np.ndarray, poses: np.ndarray) -> Trajecto
     return Trajectory(times, dense, speeds, progress)
 
 
-class Way:
-    """The line that a trajectory follows, to be asked by arc length; it goes on straight at both ends.
+class DrivenPath:
+    """Path of a trajectory, parameterized by arc length; straight beyond both ends.
 
     Parameters
     ----------
@@ -77,7 +77,7 @@ class Way:
         self.poses = trajectory.poses[index]
 
     def place(self, s: np.ndarray, offset: np.ndarray | float) -> np.ndarray:
-        """Give poses beside the line.
+        """Return poses beside the line.
 
         Parameters
         ----------
@@ -116,7 +116,7 @@ def park_vehicles(
     rng : numpy.random.Generator
         Draws them.
     parked_share : float
-        Share of the free places that are taken, in runs of five places.
+        Fraction of the free places that are taken, in runs of five places.
     first_object : int
         Object number of the first vehicle.
 
@@ -125,12 +125,12 @@ def park_vehicles(
     mesh : Mesh
         The vehicles; empty if there is none.
     """
-    way, meshes = Way(trajectory), []
-    s = np.arange(0.5 * SLOT_M, way.arc[-1], SLOT_M)
-    things, lane = cKDTree(taken), cKDTree(way.poses[:, :2])
+    path, meshes = DrivenPath(trajectory), []
+    s = np.arange(0.5 * SLOT_M, path.arc[-1], SLOT_M)
+    things, lane = cKDTree(taken), cKDTree(path.poses[:, :2])
     for offset in (KERB_M, -LANE_M - KERB_M):
         runs = np.repeat(rng.random(len(s) // 5 + 1), 5)[: len(s)] < parked_share
-        slots = way.place(s[runs], offset + rng.normal(0.0, 0.1, runs.sum()))
+        slots = path.place(s[runs], offset + rng.normal(0.0, 0.1, runs.sum()))
         slots[:, 2] += np.pi * (offset < 0.0) + rng.normal(0.0, 0.03, len(slots))
         ahead = 1.7 * np.stack([np.cos(slots[:, 2]), np.sin(slots[:, 2])], axis=-1)
         is_free = np.ones(len(slots), dtype=bool)
@@ -146,7 +146,7 @@ def park_vehicles(
 def plan_encounters(
     trajectory: Trajectory, rng: np.random.Generator, *, vehicles_per_min: float, people_per_min: float
 ) -> Traffic:
-    """Draw who is met: vehicles that come towards the car, lead or follow it, and people on foot.
+    """Draw traffic along a recorded trajectory: oncoming, leading and following vehicles, people on foot.
 
     Parameters
     ----------
@@ -162,17 +162,17 @@ def plan_encounters(
     traffic : Traffic
         Each body is there while it is near.
     """
-    way, bodies = Way(trajectory), _draw_catalogue(rng)
+    path, bodies = DrivenPath(trajectory), _draw_catalogue(rng)
     walkers = [build_pedestrian(rng) for _ in range(6)]
     movers: list[tuple[Mesh, int, np.ndarray]] = []
     for stamp in _draw_times(trajectory, vehicles_per_min, 2.5, rng):
-        movers.append((bodies[int(rng.integers(CATALOGUE))], *_oncoming(trajectory, way, stamp, rng)))
+        movers.append((bodies[int(rng.integers(CATALOGUE))], *_oncoming(trajectory, path, stamp, rng)))
     for sign in (1.0, -1.0):
         for begin, end in _draw_spans(trajectory, rng):
-            track = _same_way(trajectory, way, begin, end, sign, rng)
+            track = _same_way(trajectory, path, begin, end, sign, rng)
             movers.append((bodies[int(rng.integers(CATALOGUE))], begin, track))
     for stamp in _draw_times(trajectory, people_per_min, 0.5, rng):
-        movers.append((walkers[int(rng.integers(6))], *_on_foot(trajectory, way, stamp, rng)))
+        movers.append((walkers[int(rng.integers(6))], *_on_foot(trajectory, path, stamp, rng)))
     meshes, begins, tracks = zip(*movers, strict=True) if movers else ((), (), ())
     return Traffic(tuple(meshes), np.array(begins, dtype=np.int64), tuple(tracks))
 
@@ -207,12 +207,12 @@ def _grid(trajectory: Trajectory, begin: float, end: float) -> tuple[np.ndarray,
 
 
 def _oncoming(
-    trajectory: Trajectory, way: Way, meet_us: int, rng: np.random.Generator
+    trajectory: Trajectory, path: DrivenPath, meet_us: int, rng: np.random.Generator
 ) -> tuple[int, np.ndarray]:
     speed, offset = float(rng.uniform(5.5, 7.5)), -LANE_M + float(rng.normal(0.0, 0.25))
     stamps, progress = _grid(trajectory, meet_us - 20e6, meet_us + 20e6)
     at_meeting = np.interp(meet_us - stamps[0], stamps - stamps[0], progress)
-    poses = way.place(at_meeting - speed * (stamps - meet_us) * 1e-6, offset)
+    poses = path.place(at_meeting - speed * (stamps - meet_us) * 1e-6, offset)
     return int(stamps[0]), poses + (0.0, 0.0, np.pi)
 
 
@@ -228,21 +228,21 @@ def _draw_spans(trajectory: Trajectory, rng: np.random.Generator) -> list[tuple[
 
 
 def _same_way(
-    trajectory: Trajectory, way: Way, begin: int, end: int, sign: float, rng: np.random.Generator
+    trajectory: Trajectory, path: DrivenPath, begin: int, end: int, sign: float, rng: np.random.Generator
 ) -> np.ndarray:
     """A vehicle ahead (+1) or behind (-1), 9 m away at least; it comes and goes at 60 m."""
     stamps, progress = _grid(trajectory, begin, end)
     along = np.linspace(-1.0, 1.0, len(stamps))
     gap = 9.0 + float(rng.uniform(0.0, 9.0)) + 45.0 * np.abs(along) ** 6
     gap += 1.5 * np.sin((stamps - begin) * 1e-6 / 3.0)
-    return way.place(progress + sign * gap, float(rng.normal(0.0, 0.2)))
+    return path.place(progress + sign * gap, float(rng.normal(0.0, 0.2)))
 
 
 def _on_foot(
-    trajectory: Trajectory, way: Way, meet_us: int, rng: np.random.Generator
+    trajectory: Trajectory, path: DrivenPath, meet_us: int, rng: np.random.Generator
 ) -> tuple[int, np.ndarray]:
     stamps, progress = _grid(trajectory, meet_us - 15e6, meet_us + 15e6)
     at_meeting = float(np.interp(meet_us - stamps[0], stamps - stamps[0], progress))
     walked = float(rng.choice([-1.3, 0.0, 1.3], p=[0.4, 0.2, 0.4])) * (stamps - meet_us) * 1e-6
     offset = 3.6 + float(rng.uniform(0.0, 1.0)) if rng.random() < 0.6 else -7.0 - float(rng.uniform(0.0, 1.0))
-    return int(stamps[0]), way.place(at_meeting + walked, offset)
+    return int(stamps[0]), path.place(at_meeting + walked, offset)

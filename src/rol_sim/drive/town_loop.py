@@ -1,4 +1,4 @@
-"""A trajectory along the loop: where the radar is at any microsecond.
+"""Plan a trajectory along the town's loop: the radar's pose at any microsecond.
 
 The line keeps to the left of the carriageway, wanders a little and is rounded at corners; the speed respects
 lateral and longitudinal acceleration; the car stands at the start and at some junctions. All in the town
@@ -17,7 +17,7 @@ from rol_sim.world.streets import StreetPlan
 
 LATERAL_ACCELERATION = 1.8  # [m/s^2]
 ACCELERATION, BRAKING = 1.3, 1.7  # [m/s^2]
-POSE_STEP_US = 5_000  # truth is kept at 200 Hz
+POSE_STEP_US = 5_000  # true poses are kept at 200 Hz
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,7 @@ class Route:
         return len(self.points) * self.spacing
 
     def place(self, s: np.ndarray, offset: np.ndarray | float) -> np.ndarray:
-        """Give points beside the route.
+        """Return points beside the route.
 
         Parameters
         ----------
@@ -94,7 +94,7 @@ class Trajectory:
     progress: np.ndarray
 
     def pose(self, query_us: np.ndarray) -> np.ndarray:
-        """Give the poses at any times of the trajectory.
+        """Return the poses at any times of the trajectory.
 
         Parameters
         ----------
@@ -117,7 +117,7 @@ class Trajectory:
         return np.stack([x, y, wrap_angle(yaw)], axis=-1)
 
     def velocity(self, query_us: np.ndarray) -> np.ndarray:
-        """Give the velocities in the town at any times of the trajectory, shape (m, 2) [m/s]."""
+        """Return the velocities in the town at any times of the trajectory, shape (m, 2) [m/s]."""
         t = self._seconds(query_us)
         speed = np.interp(t, (self.stamps_us - self.stamps_us[0]) * 1e-6, self.speeds)
         yaw = self.pose(query_us)[:, 2]

@@ -1,4 +1,4 @@
-"""Who else is on the move: oncoming and leading vehicles, side-street traffic, people on the pavements.
+"""Simulate traffic: oncoming and leading vehicles, side-street traffic, people on the pavements.
 
 `plan_traffic` draws bodies and their poses over the session; `Traffic.meshes_at` sets them down at one time.
 """

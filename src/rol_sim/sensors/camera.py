@@ -1,4 +1,4 @@
-"""Pictures of the simulated town for the reader: a plan from above and a view from a place. No sensor uses them."""
+"""Render pictures of the simulated world: a plan from above and a view from a pose. No sensor uses them."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ LIGHT = np.array([-0.35, 0.45, 0.82])  # unit vector to the sun
 
 
 def paint_table() -> np.ndarray:
-    """Give the colour of every material, shape (n_materials, 3), grey where none is set."""
+    """Return the colour of every material, shape (n_materials, 3), grey where none is set."""
     table = np.full((max(Material) + 1, 3), 0.6)
     for material in Material:
         table[material] = PAINT.get(material.name, (0.6, 0.6, 0.6))
@@ -98,7 +98,7 @@ def view_rays(
 
 
 def render(scene: object, rays: np.ndarray, shape: tuple[int, int], haze_m: float = 250.0) -> np.ndarray:
-    """Paint what rays hit first, with sunlight, cast shadows and haze.
+    """Render first hits with sunlight, cast shadows and haze.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""The simulated HDL-32E: one turn of 32 lasers while the car moves, in the units of Oxford's raw files.
+"""Simulate sweeps of an HDL-32E, one turn of 32 lasers while the car moves, in the units of Oxford's raw files.
 
 Radar frame: x forward, y left, z up, level, above the ground by the mast's height. The lidar's place in it
 is its extrinsic calibration. Angles run clockwise seen from above, 0 to the lidar's left, elevations
@@ -21,7 +21,7 @@ FIRING_US = 46.08  # time between two firings of the same laser
 FIRINGS_PER_PACKET = 12
 TURN_US = 50_000.0
 
-# Material -> share of light sent back by a head-on surface, share of rays lost without a trace, softness [m].
+# Material -> fraction of light sent back by a head-on surface, fraction of rays lost without a trace, softness [m].
 SURFACES = {
     "GROUND": (0.12, 0.01, 0.0),
     "PAVEMENT": (0.22, 0.01, 0.0),
@@ -48,8 +48,8 @@ class LidarSettings:
     ----------
     range_noise_m : float
         Standard deviation of a range [m].
-    lost_share : float
-        Share of returns lost at random, besides those that the surface swallows.
+    lost_fraction : float
+        Fraction of returns lost at random, besides those that the surface swallows.
     max_range_m : float
         Farthest range [m].
     reach_m : float
@@ -62,18 +62,18 @@ class LidarSettings:
     """
 
     range_noise_m: float = 0.02
-    lost_share: float = 0.01
+    lost_fraction: float = 0.01
     max_range_m: float = 100.0
     reach_m: float = 75.0
 
     def __post_init__(self) -> None:
-        allowed = {"[0, inf)": "range_noise_m", "[0, 1]": "lost_share", "(0, inf)": "max_range_m reach_m"}
+        allowed = {"[0, inf)": "range_noise_m", "[0, 1]": "lost_fraction", "(0, inf)": "max_range_m reach_m"}
         check_fields(self, allowed)
 
 
 @dataclass(frozen=True)
 class Sweep:
-    """One turn as the raw file holds it, with the truth that no file holds.
+    """One turn in the units of the raw file, with the true materials.
 
     Attributes
     ----------
@@ -98,14 +98,14 @@ class Sweep:
 
 @lru_cache
 def surface_table() -> np.ndarray:
-    """Give the rows of `SURFACES` in the order of `Material`, shape (n_materials, 3)."""
+    """Return the rows of `SURFACES` in the order of `Material`, shape (n_materials, 3)."""
     return np.array([SURFACES.get(m.name, (0.0, 1.0, 0.0)) for m in Material], dtype=np.float32)
 
 
 def schedule_firings(
     start_us: int, rng: np.random.Generator, *, turn_us: float = TURN_US, first_angle: float = 0.0
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Give times and angles of the firings of one turn.
+    """Return times and angles of the firings of one turn.
 
     Parameters
     ----------
@@ -135,7 +135,7 @@ def schedule_firings(
 
 
 def sweep_rays(angles: np.ndarray, T_radar_lidar: np.ndarray, poses: np.ndarray, height: float) -> np.ndarray:
-    """Give the rays of one turn in the town's frame.
+    """Return the rays of one turn in the town's frame.
 
     Parameters
     ----------
@@ -181,7 +181,7 @@ def simulate_sweep(
     rng: np.random.Generator,
     settings: LidarSettings | None = None,
 ) -> Sweep:
-    """Sweep the town once while the car moves.
+    """Simulate one sweep while the car moves.
 
     Parameters
     ----------
@@ -209,11 +209,13 @@ def simulate_sweep(
     hits = scene.cast(sweep_rays(angles, T_radar_lidar, poses, height))
     reached = np.flatnonzero(hits.t < settings.max_range_m)
     r, cosine, material = hits.t[reached], hits.cos_incidence[reached], hits.material[reached]
-    reflectivity, lost_share, softness = surface_table()[material].T
+    reflectivity, lost_fraction, softness = surface_table()[material].T
     draws = rng.standard_normal((4, len(reached)), dtype=np.float32)
     # The weakest return that is noticed varies, so that surfaces fade out without a sharp edge.
     faintest = 0.1 / settings.reach_m**2 * np.exp(0.35 * draws[0])
-    is_lost = rng.random(len(reached), dtype=np.float32) > (1.0 - lost_share) * (1.0 - settings.lost_share)
+    is_lost = rng.random(len(reached), dtype=np.float32) > (1.0 - lost_fraction) * (
+        1.0 - settings.lost_fraction
+    )
     is_seen = (reflectivity * cosine > faintest * np.maximum(r, 1.0) ** 2) & ~is_lost
     r = r + settings.range_noise_m * draws[1] + np.abs(draws[2]) * softness
     is_seen &= (r > 0.9) & (r < settings.max_range_m)

@@ -1,8 +1,8 @@
-"""A simulated CTS350-X: what a turning 77 GHz radar sees of a scene of triangles.
+"""Simulate scans of a CTS350-X, a spinning 77 GHz radar, in a scene of triangles.
 
 A fan of rays, a few per azimuth and height layer, is cast once per turn; each ray starts where the radar is
-at that moment. Surfaces answer by material, angle and a fixed grain of the world, leaves let part of the
-power through, smooth surfaces mirror rays so that ghosts appear behind them. `radar_signal` turns the echoes
+at that moment. Surfaces scatter by material, angle and a fixed texture of the world; leaves transmit part of
+the power; smooth surfaces mirror rays, so that ghosts appear behind them. `radar_signal` turns the echoes
 into bytes.
 
 World frame as in `scene`; poses (x, y, yaw) in the plane, yaw counter-clockwise. The antenna turns clockwise,
@@ -30,7 +30,7 @@ WEAKEST_ONWARD = 3.0  # a ray is followed on while a perfect scatterer would ret
 
 @dataclass(frozen=True)
 class RadarSettings:
-    """What can be tuned about the simulated radar.
+    """Settings of the simulated radar.
 
     Attributes
     ----------
@@ -46,12 +46,12 @@ class RadarSettings:
     range_exponent : float
         Such a scatterer's power falls with range to this power.
     clutter_tail_db, clutter_tail_m : float
-        Every surface is followed by a haze of echoes that took a longer way (in through windows, between cars
-        and walls): their mean power relative to the surface's [dB], and how far they reach on the mean [m].
+        Clutter tail: every surface is followed by echoes of longer paths (through windows, between cars and
+        walls). Their mean power relative to the surface's [dB], and their mean delay [m].
     bounces : int
         How often a ray is mirrored on.
     transmission_layers : int
-        Through how many leaves a ray may pass.
+        Number of leaves that a ray may pass.
     doppler_seconds : float
         Range shift per closing speed [s].
     max_range : float
@@ -99,18 +99,18 @@ class RadarSettings:
 
 @dataclass
 class Rays:
-    """Rays under way.
+    """Rays in flight.
 
     Attributes
     ----------
     origin, direction : array, shape (n, 3), float32
-        Where this leg of the way starts [m], and its unit direction.
+        Where this leg of the path starts [m], and its unit direction.
     heading : array, shape (n, 3), float32
         Direction in which the ray left the radar: there its echoes are seen, wherever it went then.
     row : array, shape (n,), float32
         Azimuth row, fractional.
     length, weight : array, shape (n,), float32
-        Way so far [m]; power that a perfect scatterer 10 m away would return.
+        Path so far [m]; power that a perfect scatterer 10 m away would return.
     bounced : array, shape (n,), int32
         How often it was mirrored.
     """
@@ -124,12 +124,12 @@ class Rays:
     bounced: np.ndarray
 
     def take(self, index: np.ndarray) -> Rays:
-        """Give some of the rays."""
+        """Select rays by index."""
         return Rays(*(getattr(self, part.name)[index] for part in fields(self)))
 
 
 def beam_azimuths() -> np.ndarray:
-    """Give the direction of every row in the radar's frame.
+    """Return the direction of every row in the radar's frame.
 
     Returns
     -------
@@ -199,7 +199,7 @@ def simulate_scan(
 
 
 def emit_rays(row_poses: np.ndarray, rng: np.random.Generator, settings: RadarSettings) -> Rays:
-    """Spread the fan of one turn: rows x rays per row x layers, each ray a little off its place.
+    """Generate the rays of one turn: rows x rays per row x layers, with jitter.
 
     Parameters
     ----------
@@ -241,7 +241,7 @@ def emit_rays(row_poses: np.ndarray, rng: np.random.Generator, settings: RadarSe
 
 
 def trace_echoes(scene: Scene, rays: Rays, settings: RadarSettings) -> tuple[np.ndarray, ...]:
-    """Follow rays through leaves and off mirrors, and collect what comes back.
+    """Trace rays through leaves and off mirrors, and collect the echoes.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""From echoes to the bytes of a CTS350-X scan: point spread, speckle, noise, streaks, leakage, codes.
+"""Convert point echoes to the bytes of a CTS350-X scan: point spread, speckle, noise, streaks, leakage, codes.
 
 All constants here were measured on real scans. Columns are range bins, rows azimuths in the order of the
 turn. The field is complex: echoes add with their phases, so speckle and its correlation come out by
@@ -19,9 +19,9 @@ from rol.radar import MEASURED
 HANN_BINS = 5.9
 NOISE_STEP = 5  # the noise is limited to 1/5.9 of the band, so every fifth bin determines the others
 NOISE_RANGES_M = np.array([0.0, 3.0, 6.0, 28.0, 41.0, 80.0, 106.0, 145.0, 165.0])
-# Mean noise power at these ranges, from the share of code 0 in quiet bins.
+# Mean noise power at these ranges, from the fraction of code 0 in quiet bins.
 NOISE_POWERS = np.array([0.7, 0.75, 1.55, 2.25, 2.35, 2.1, 1.85, 1.55, 1.5])
-# The integer power is floor(power + 0.72): with exponential noise this fits the shares of codes 0, 6, 9, 12,
+# The integer power is floor(power + 0.72): with exponential noise this fits the fractions of codes 0, 6, 9, 12,
 # ...
 ROUNDING = 0.72
 
@@ -51,7 +51,7 @@ KERNEL_HALF, KERNEL_STEPS = 48, 16
 
 
 def power_to_codes(powers: np.ndarray) -> np.ndarray:
-    """Turn integer powers into the sensor's half-dB codes.
+    """Convert integer powers to the sensor's half-dB codes.
 
     The sensor takes its logarithm from the position of the leading one and a straight line through the bits
     below it: p = round(20 log10(2) * (e + m)) for n = 2^e (1 + m). On real scans this gives exactly the
@@ -72,7 +72,7 @@ def power_to_codes(powers: np.ndarray) -> np.ndarray:
 
 
 def codes_to_power(codes: np.ndarray) -> np.ndarray:
-    """Turn codes into the power that lies in their middle.
+    """Convert codes to the power in their middle.
 
     Parameters
     ----------
@@ -90,7 +90,7 @@ def codes_to_power(codes: np.ndarray) -> np.ndarray:
 
 
 def range_to_bins(ranges_m: np.ndarray) -> np.ndarray:
-    """Give the place of a range on the axis of bins.
+    """Convert ranges to fractional bins.
 
     Parameters
     ----------
@@ -106,7 +106,7 @@ def range_to_bins(ranges_m: np.ndarray) -> np.ndarray:
 
 
 def range_response(bins: np.ndarray) -> np.ndarray:
-    """Give the amplitude that a point leaves some bins away.
+    """Compute the range response: amplitude of a point some bins away.
 
     Parameters
     ----------
@@ -132,7 +132,7 @@ def echoes_to_codes(
     streak_scale: float = 1.0,
     interference_rate: float = 0.3,
 ) -> np.ndarray:
-    """Draw point echoes as the sensor would record them.
+    """Simulate the sensor's record of point echoes.
 
     Parameters
     ----------
@@ -172,7 +172,7 @@ def echoes_to_codes(
 
 
 def add_interference(field: np.ndarray, rng: np.random.Generator, rate: float) -> None:
-    """Let other radars disturb some rows: smooth, bright, along the whole row.
+    """Add the interference of other radars to some rows: smooth, bright, along the whole row (in place).
 
     Parameters
     ----------
@@ -210,7 +210,7 @@ def _block_noise() -> np.ndarray:
 
 @lru_cache(maxsize=1)
 def _streak_matrix() -> np.ndarray:
-    """What an echo in block i adds to the floor of block j, as a share of its power."""
+    """What an echo in block i adds to the floor of block j, as a fraction of its power."""
     blocks = np.arange(-(-N_BINS // BLOCK))
     away = (blocks[None, :] - blocks[:, None]) * float(BLOCK)
     skirt = 10.0 ** (SKIRT_DB / 10.0) / (1.0 + (np.abs(away) / 50.0) ** 1.5) + 10.0 ** (FAR_SKIRT_DB / 10.0)

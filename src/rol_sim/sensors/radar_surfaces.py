@@ -1,7 +1,7 @@
-"""How surfaces answer a 77 GHz radar: diffuse, mirror-like, with corners, or veiled by leaves.
+"""Scattering of a 77 GHz radar by surfaces: diffuse, specular, corners, and transmission through leaves.
 
-World frame as in `scene`, metres. The world has a fixed grain: every half metre of a wall answers in its own
-way, and in the same way whenever it is looked at, so that scans of one place resemble each other.
+World frame as in `scene`, metres. Every half metre of a wall has a reflectivity of its own, the same whenever
+it is seen, so that scans of one place resemble each other.
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ from rol_sim.world.mesh import Material
 CELL = 0.5  # grain of the world along a surface [m]: what a brick pier, a drain pipe, a window frame take up
 MOST_CELLS = 12  # cells that may answer between two neighbouring rays
 ASPECT = np.deg2rad(4.0)  # incidence over which a cell answers alike
-MOST_LATER, LATER_POWER = 8, 4.0  # echoes that came a longer way: how many at most, and of what power each
+MOST_LATER, LATER_POWER = 8, 4.0  # echoes of the clutter tail: how many at most, and of what power each
 WEAKEST = 0.05  # echoes of less power drown in the noise
 
 
 @dataclass(frozen=True)
 class Surface:
-    """How a material answers the radar.
+    """Scattering of a material.
 
     Attributes
     ----------
@@ -35,12 +35,12 @@ class Surface:
         Power of the cosine of incidence that the diffuse part follows.
     specular, lobe_deg : float
         Height and half width (1/e) [deg] of the lobe of surfaces seen square on.
-    corner, corner_share : float
-        Mean power of corners, that answer at every incidence, and the share of cells that hold one.
+    corner, corner_fraction : float
+        Mean power of corners, which scatter at every incidence, and the fraction of cells that hold one.
     mirror : float
-        Share of power mirrored onwards.
+        Fraction of power mirrored onwards.
     passes : float
-        Share of power that goes straight through.
+        Fraction of power that goes straight through.
 
     Raises
     ------
@@ -53,7 +53,7 @@ class Surface:
     specular: float = 0.0
     lobe_deg: float = 2.0
     corner: float = 0.0
-    corner_share: float = 0.0
+    corner_fraction: float = 0.0
     mirror: float = 0.0
     passes: float = 0.0
 
@@ -61,7 +61,7 @@ class Surface:
         allowed = {
             "[0, inf)": "diffuse slope specular corner",
             "(0, 90]": "lobe_deg",
-            "[0, 1]": "corner_share mirror passes",
+            "[0, 1]": "corner_fraction mirror passes",
         }
         check_fields(self, allowed)
 
@@ -87,7 +87,7 @@ OTHER_SURFACE = Surface(0.05)
 
 
 def surface_table(changed: dict[str, Surface]) -> np.ndarray:
-    """Put the constants of all materials into a table by material number.
+    """Tabulate the constants of all materials by material number.
 
     Parameters
     ----------
@@ -103,7 +103,16 @@ def surface_table(changed: dict[str, Surface]) -> np.ndarray:
     for material in Material:
         s = {**SURFACES, **changed}.get(material.name, OTHER_SURFACE)
         lobe = np.deg2rad(s.lobe_deg)
-        table[material] = (s.diffuse, s.slope, s.specular, lobe, s.corner, s.corner_share, s.mirror, s.passes)
+        table[material] = (
+            s.diffuse,
+            s.slope,
+            s.specular,
+            lobe,
+            s.corner,
+            s.corner_fraction,
+            s.mirror,
+            s.passes,
+        )
     return table
 
 
@@ -255,7 +264,7 @@ def _add_clutter_tail(hits, i, along, power, tail_m, echoes, count):  # pragma: 
 
 @compiled
 def _step_aside(heading, total, dx, dy):  # pragma: no cover (compiled)
-    """Turn and range of a place (dx, dy) beside the end of a way of given heading and length."""
+    """Turn and range of a place (dx, dy) beside the end of a path of given heading and length."""
     x, y = total * heading[0], total * heading[1]
     turn = np.arctan2(x * dy - y * dx, x * (x + dx) + y * (y + dy))
     return turn, np.sqrt((x + dx) ** 2 + (y + dy) ** 2 + (total * heading[2]) ** 2)
@@ -263,7 +272,7 @@ def _step_aside(heading, total, dx, dy):  # pragma: no cover (compiled)
 
 @compiled
 def _answer(surface, cosine, number, cell, z):  # pragma: no cover (compiled)
-    """Backscatter of one cell of the world, as a share of a perfect scatterer's.
+    """Backscatter of one cell of the world, as a fraction of a perfect scatterer's.
 
     A cell has a strength of its own, times one that changes every few degrees of incidence: seen from ten metres on, a
     wall glints elsewhere.

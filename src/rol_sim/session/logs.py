@@ -1,4 +1,4 @@
-"""What a session's slow logs hold: when scans and sweeps begin, row times, odometry with drift, GPS and INS.
+"""Simulate the slow logs of a session: times of scans, rows and sweeps, odometry with drift, GPS and INS.
 
 Everything here is drawn from given generators and the true trajectory; nothing is written.
 """
@@ -23,7 +23,7 @@ _CONVERGENCE = np.deg2rad(1.365)  # angle between grid north and true north ther
 def schedule_scans(
     first_stamp_us: int, count: int, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Give the times of the radar's turns, as measured: 0.24999 s, spread 1.5 ms, neighbours alike.
+    """Return the times of the radar's turns, as measured: 0.24999 s, spread 1.5 ms, neighbours alike.
 
     Parameters
     ----------
@@ -52,7 +52,7 @@ def schedule_scans(
 
 
 def draw_row_stamps(stamp_us: int, turn_us: int, rng: np.random.Generator) -> np.ndarray:
-    """Give the times that stand in a scan's rows: they come in bursts of 16, as measured.
+    """Return the times that stand in a scan's rows: they come in bursts of 16, as measured.
 
     Parameters
     ----------
@@ -80,12 +80,12 @@ def draw_row_stamps(stamp_us: int, turn_us: int, rng: np.random.Generator) -> np
 
 
 def scan_row_times(stamp_us: int, turn_us: int) -> np.ndarray:
-    """Give the true times at which the beam looks along each row, shape (400,), evenly spread [us]."""
+    """Return the true times at which the beam looks along each row, shape (400,), evenly spread [us]."""
     return stamp_us + (np.arange(N_AZIMUTHS) + 0.5) * turn_us / N_AZIMUTHS
 
 
 def schedule_sweeps(begin_us: int, end_us: int, rng: np.random.Generator) -> np.ndarray:
-    """Give the begins of a lidar's turns, 20 a second with a phase of their own.
+    """Return the begins of a lidar's turns, 20 a second with a phase of their own.
 
     Parameters
     ----------
@@ -139,7 +139,7 @@ def drift_odometry(
     scale_spread: float = 0.0015,
     yaw_spread_rad: float = 2.0e-4,
 ) -> np.ndarray:
-    """Give the steps between true poses as an odometry would: wrong scale, drifting heading, a little noise.
+    """Simulate odometry increments between true poses: scale error, heading drift, noise.
 
     Parameters
     ----------
@@ -150,7 +150,7 @@ def drift_odometry(
     scale_spread : float
         Spread of the forward scale error, drawn once.
     yaw_spread_rad : float
-        Spread of the heading error of every step [rad].
+        Spread of the heading error of every increment [rad].
 
     Returns
     -------
@@ -158,14 +158,14 @@ def drift_odometry(
         Pose of the later frame in the earlier one (x, y, yaw) [m, m, rad].
     """
     steps = relative_pose(poses[:-1], poses[1:])
-    moving = np.minimum(np.hypot(steps[:, 0], steps[:, 1]) / 0.5, 1.0)  # a standing car hardly drifts
+    moving = np.minimum(np.hypot(steps[:, 0], steps[:, 1]) / 0.5, 1.0)  # a stationary vehicle hardly drifts
     steps[:, 0] *= 1.0 + float(np.clip(rng.normal(0.0, 1.0), -2.0, 2.0)) * scale_spread
     noise = rng.normal(0.0, 1.0, steps.shape) * (0.004, 0.003, yaw_spread_rad)
     return steps + noise * (0.1 + 0.9 * moving)[:, None]
 
 
 def draw_gps(trajectory: Trajectory, rng: np.random.Generator) -> pd.DataFrame:
-    """Give what a 5 Hz GPS receiver logs on a trajectory, errors of about a metre that change slowly.
+    """Return what a 5 Hz GPS receiver logs on a trajectory, errors of about a metre that change slowly.
 
     Parameters
     ----------
@@ -197,7 +197,7 @@ def draw_gps(trajectory: Trajectory, rng: np.random.Generator) -> pd.DataFrame:
 
 
 def draw_ins(trajectory: Trajectory, rng: np.random.Generator) -> pd.DataFrame:
-    """Give what a 50 Hz inertial navigation system logs on a trajectory.
+    """Return what a 50 Hz inertial navigation system logs on a trajectory.
 
     Parameters
     ----------

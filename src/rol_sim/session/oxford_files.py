@@ -45,7 +45,7 @@ def _write_png(path: Path | str, image: np.ndarray) -> None:
 
 
 def _cast(path: Path | str, name: str, values: np.ndarray, dtype: type, shape: tuple[int, ...]) -> np.ndarray:
-    """Give values in the file's type; refuse another shape or a value that the type cannot hold."""
+    """Return values in the file's type; refuse another shape or a value that the type cannot hold."""
     values = np.asarray(values)
     if values.shape != shape:
         raise OxfordError(f"{path}: {name}: expected shape {shape}, got {values.shape}")

@@ -1,4 +1,4 @@
-"""The settings of simulated sessions: what may stand in the `simulated:` section of a config file."""
+"""Settings of simulated sessions: the section `simulated:` of a config file."""
 
 from __future__ import annotations
 
@@ -13,12 +13,14 @@ import yaml
 
 from rol.files import read_text
 from rol.geometry import check_fields
+from rol_sim.sensors.lidar import LidarSettings
+from rol_sim.sensors.radar import RadarSettings
 
 SWEEPS = ("nearest", "all", "none")
 
 
 class SettingsError(ValueError):
-    """A setting that does not exist or cannot be."""
+    """A setting does not exist or its value is invalid."""
 
 
 @dataclass(frozen=True)
@@ -40,11 +42,11 @@ class SessionSettings:
     stand_s : float
         How long the car stands at the start [s].
     parked_share : float
-        Share of the parking places that are taken, 0 .. 1.
+        Fraction of the parking places that are taken, 0 .. 1.
     leaf_density : float
         Leaves on the trees, 1 is usual.
     changed_share : float
-        Share of the street furniture changed and, times three, of the hedges cut, 0 .. 0.3.
+        Fraction of the street furniture changed and, times three, of the hedges cut, 0 .. 0.3.
     vehicles, people : int
         Traffic: how many there are in the town, or how many come towards the car in a minute of the route.
     sweeps : str
@@ -99,7 +101,7 @@ class SessionSettings:
 
 @dataclass(frozen=True)
 class SimulationSettings:
-    """What all sessions of a config share, and the sessions.
+    """Settings common to all sessions of a config, and the sessions.
 
     Attributes
     ----------
@@ -119,7 +121,7 @@ class SimulationSettings:
         "nearest": only the sweeps nearest to a scan's stamp and to its middle are made; "all": every one;
         "none".
     labels_every : int
-        Of every so manieth sweep the true materials are written as well; 0 for none.
+        Of every n-th sweep the true materials are written as well; 0 for none.
     odometry_scale : float
         Spread of the forward scale error of gt/radar_odometry.csv, drawn once per session.
     odometry_yaw_rad : float
@@ -129,7 +131,7 @@ class SimulationSettings:
     real_root : str
         World "route" only: folder of the real data; may be empty, see `rall.find_real_root`.
     unmapped_share : float
-        World "route" only: things that the map does not show, as a share of the groups of cells that it shows.
+        World "route" only: things that the map does not show, as a fraction of the groups of cells that it shows.
     lidar, radar : dict
         Settings of `LidarSettings` and `RadarSettings` other than the usual ones.
 
@@ -203,7 +205,7 @@ def parse_settings(section: Mapping[str, Any], where: str = "simulated") -> Simu
             )
         if session.scans < 3 and not (section.get("world") == "route" and session.scans == 0):
             raise SettingsError(
-                f"{place}: scans: {session.scans} is too few, 3 are needed for one step of odometry"
+                f"{place}: scans: {session.scans} is too few, 3 are needed for one odometry increment"
             )
         sessions[str(name)] = session
     return _fill(SimulationSettings, section, where, sessions=sessions)
@@ -265,7 +267,7 @@ def read_settings(path: Path | str) -> SimulationSettings:
 
 
 def describe(settings: SimulationSettings, name: str) -> dict[str, Any]:
-    """Give all settings that bear on one session as plain values, for its json files.
+    """Return all settings of one session as plain values, for its JSON files.
 
     Parameters
     ----------
@@ -291,6 +293,43 @@ def describe(settings: SimulationSettings, name: str) -> dict[str, Any]:
     values = asdict(settings)
     del values["sessions"], values["real_root"]  # where the real data lie changes nothing in a session
     return {**values, "session": asdict(settings.sessions[name])}
+
+
+def sensor_settings(settings: SimulationSettings) -> tuple[LidarSettings, RadarSettings]:
+    """Return the settings of both sensors, the defaults where nothing else is given.
+
+    Parameters
+    ----------
+    settings : SimulationSettings
+        The settings of all sessions.
+
+    Returns
+    -------
+    lidar : LidarSettings
+        Of both lidars.
+    radar : RadarSettings
+        Of the radar, its height included.
+
+    Raises
+    ------
+    SettingsError
+        If a sensor has no such setting, or its value is out of its range.
+    """
+    radar = {"height": settings.radar_height_m, **settings.radar}
+    return _fill_sensor(LidarSettings, settings.lidar, "lidar"), _fill_sensor(RadarSettings, radar, "radar")
+
+
+def _fill_sensor(kind: type, values: dict[str, Any], name: str) -> Any:
+    known = [f.name for f in fields(kind)]
+    unknown = sorted(set(values) - set(known))
+    if unknown:
+        raise SettingsError(f"simulated: {name}: unknown key {unknown[0]!r}; known are: {', '.join(known)}")
+    try:
+        return kind(
+            **{key: tuple(value) if isinstance(value, list) else value for key, value in values.items()}
+        )
+    except ValueError as error:
+        raise SettingsError(f"simulated: {name}: {error}") from error
 
 
 def _as_mapping(value: Any, where: str) -> Mapping[str, Any]:

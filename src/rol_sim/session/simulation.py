@@ -1,4 +1,4 @@
-"""A simulated session before it is a folder: the town as it finds it, drive, traffic, times, scans, sweeps.
+"""Build simulated sessions in memory: world, trajectory, traffic, times, scans and sweeps.
 
 Every scan and sweep has a generator of its own, so each can be made alone and in any order; `writer` puts
 them on disk.
@@ -7,12 +7,10 @@ them on disk.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from pathlib import Path
-from typing import Any
 
-import cv2
 import numpy as np
 
 from rol.maps import thin_points
@@ -20,19 +18,22 @@ from rol.oxford import (
     EXTRINSICS,
     LIDARS,
     N_AZIMUTHS,
-    RANGE_UNIT,
     RadarScan,
-    load_velodyne_raw,
-    velodyne_raw_to_points,
 )
 from rol_data import rall
 from rol_sim.drive.recorded_poses import interpolate_trajectory, park_vehicles, plan_encounters
 from rol_sim.drive.town_loop import Trajectory, build_route, plan_trajectory
 from rol_sim.drive.traffic import Traffic, plan_traffic
-from rol_sim.sensors.lidar import LidarSettings, Sweep, schedule_firings, simulate_sweep
-from rol_sim.sensors.radar import COUNT_STEP, FIRST_COUNT, RadarSettings, simulate_scan
+from rol_sim.sensors.lidar import Sweep, schedule_firings, simulate_sweep
+from rol_sim.sensors.radar import COUNT_STEP, FIRST_COUNT, simulate_scan
 from rol_sim.session import logs
-from rol_sim.session.settings import SessionSettings, SettingsError, SimulationSettings, describe
+from rol_sim.session.settings import (
+    SessionSettings,
+    SettingsError,
+    SimulationSettings,
+    describe,
+    sensor_settings,
+)
 from rol_sim.world import mapped
 from rol_sim.world.mapped import Cells, classify_cells, draw_unmapped
 from rol_sim.world.mesh import Mesh, merge_meshes
@@ -48,7 +49,7 @@ OBJECTS, TRAJECTORY, TRAFFIC, SCANS, SWEEPS, ODOMETRY, GPS, INS, SCAN, SWEEP = r
 
 @dataclass(frozen=True)
 class SimulatedSession:
-    """A session before it is written: the town as it finds it, its trajectory, its traffic and its times.
+    """A session in memory: its world, trajectory, traffic and times.
 
     Attributes
     ----------
@@ -92,11 +93,11 @@ class SimulatedSession:
         return int(self.scene.static_mesh.objects.max()) + 1
 
     def generator(self, part: int, index: int = 0) -> np.random.Generator:
-        """Give the generator of one part of the session, such as one scan."""
+        """Return the random generator of one part of the session, such as one scan."""
         return _generator(self.settings, self.name, part, index)
 
     def scene_at(self, stamp_us: float, radius: float = 170.0) -> Scene:
-        """Give the town with everything that moves within a radius [m] where it is at one time [us]."""
+        """Return the town with everything that moves within a radius [m] where it is at one time [us]."""
         middle = self.trajectory.pose(np.array([stamp_us]))[0]
         return self.scene.with_moving(
             self.traffic.meshes_at(self.ground, stamp_us, self.first_mover, middle, radius)
@@ -224,7 +225,7 @@ def _find_route(
     whole, unmapped = _read_map(path, settings.seed, settings.unmapped_share)
     cells = mapped.crop_cells(whole, places, WORLD_RADIUS_M)
     lane = thin_points(poses[:, :2], 0.5)[0]
-    later = mapped.change_cells(cells, rng(OBJECTS), missing_share=own.changed_share)
+    later = mapped.change_cells(cells, rng(OBJECTS), missing_fraction=own.changed_share)
     left = mapped.join_cells(
         mapped.crop_cells(later, lane, WORLD_RADIUS_M, clear_m=CAR_M),  # the map keeps traces of traffic
         mapped.crop_cells(unmapped, lane, WORLD_RADIUS_M, clear_m=CLEAR_M),
@@ -258,7 +259,7 @@ def build_twins(real_root: Path | str, seed: int = 1, margin_s: float = 30.0) ->
     real_root : path
         Folder of the real data.
     seed : int
-        Draws what the map does not tell: heights, changes since, vehicles, noise.
+        Draws what the map does not hold: heights, changes since, vehicles, noise.
     margin_s : float
         For how long the car drives before the first and after the last scan [s].
 
@@ -314,7 +315,7 @@ def _flat(places: np.ndarray) -> np.ndarray:
 def _read_map(path: str, seed: int, unmapped_share: float) -> tuple[Cells, Cells]:
     """The map, and what stands there without being on it: the same for all sessions of a world."""
     cells = classify_cells(rall.load_map_points(path))
-    return cells, draw_unmapped(cells, np.random.default_rng([seed, 0, 98]), share=unmapped_share)
+    return cells, draw_unmapped(cells, np.random.default_rng([seed, 0, 98]), fraction=unmapped_share)
 
 
 @lru_cache(maxsize=1)
@@ -323,7 +324,7 @@ def _build_town(seed: int, loop_m: float, relief_m: float) -> Town:
 
 
 def make_scan(session: SimulatedSession, index: int) -> RadarScan:
-    """Make one radar scan.
+    """Simulate one radar scan.
 
     Parameters
     ----------
@@ -365,7 +366,7 @@ def make_scan(session: SimulatedSession, index: int) -> RadarScan:
 
 
 def make_sweep(session: SimulatedSession, sensor: str, index: int) -> Sweep:
-    """Make one lidar sweep.
+    """Simulate one lidar sweep.
 
     Parameters
     ----------
@@ -391,85 +392,3 @@ def make_sweep(session: SimulatedSession, sensor: str, index: int) -> Sweep:
     settings, _ = sensor_settings(session.settings)
     scene = session.scene_at(float(stamps[len(stamps) // 2]), settings.max_range_m + 10.0)
     return simulate_sweep(scene, stamps, angles, T_radar_lidar, poses, float(height), rng, settings)
-
-
-def label_sweep(folder: Path | str, sensor: str, stamp_us: int) -> tuple[np.ndarray, np.ndarray]:
-    """Give the points of a sweep and what each one hit, for the sweeps whose truth was written.
-
-    Parameters
-    ----------
-    folder : path
-        Folder of a simulated session.
-    sensor : str
-        "velodyne_left" or "velodyne_right".
-    stamp_us : int
-        The sweep's name [us].
-
-    Returns
-    -------
-    points : array, shape (n, 4), float32
-        As `oxford.velodyne_raw_to_points` gives them: x, y, z [m] in the lidar frame, intensity.
-    materials : array, shape (n,), uint8
-        `Material` of every point.
-
-    Raises
-    ------
-    ValueError
-        If the sweep has no labels or they do not fit; the message names the file.
-    """
-    path = Path(folder) / "labels" / sensor / f"{stamp_us}.png"
-    labels = cv2.imread(str(path), cv2.IMREAD_UNCHANGED) if path.exists() else None
-    if labels is None:
-        raise ValueError(
-            f"{path}: missing or not an image; labels are there for some sweeps only, see list_labels"
-        )
-    raw = load_velodyne_raw(Path(folder) / sensor / f"{stamp_us}.png")
-    if labels.shape != raw.ranges.shape:
-        raise ValueError(f"{path}: shape {labels.shape} for a sweep of {raw.ranges.shape}")
-    points, _ = velodyne_raw_to_points(raw)
-    return points, labels.T[raw.ranges.T * RANGE_UNIT > 1.0]
-
-
-def list_labels(folder: Path | str, sensor: str) -> np.ndarray:
-    """List the sweeps of a simulated session whose true materials were written, shape (n,), int64 [us]."""
-    return np.array(
-        sorted(int(path.stem) for path in (Path(folder) / "labels" / sensor).glob("[!.]*.png")),
-        dtype=np.int64,
-    )
-
-
-def sensor_settings(settings: SimulationSettings) -> tuple[LidarSettings, RadarSettings]:
-    """Give the settings of both sensors, the usual ones where nothing else is asked for.
-
-    Parameters
-    ----------
-    settings : SimulationSettings
-        The settings of all sessions.
-
-    Returns
-    -------
-    lidar : LidarSettings
-        Of both lidars.
-    radar : RadarSettings
-        Of the radar, its height included.
-
-    Raises
-    ------
-    SettingsError
-        If a sensor has no such setting, or its value is out of its range.
-    """
-    radar = {"height": settings.radar_height_m, **settings.radar}
-    return _fill(LidarSettings, settings.lidar, "lidar"), _fill(RadarSettings, radar, "radar")
-
-
-def _fill(kind: type, values: dict[str, Any], name: str) -> Any:
-    known = [f.name for f in fields(kind)]
-    unknown = sorted(set(values) - set(known))
-    if unknown:
-        raise SettingsError(f"simulated: {name}: unknown key {unknown[0]!r}; known are: {', '.join(known)}")
-    try:
-        return kind(
-            **{key: tuple(value) if isinstance(value, list) else value for key, value in values.items()}
-        )
-    except ValueError as error:
-        raise SettingsError(f"simulated: {name}: {error}") from error

@@ -1,8 +1,8 @@
-"""The session writer: a simulated session on disk in Oxford's own files.
+"""Write simulated sessions to disk in Oxford's own files.
 
-A session that was interrupted goes on with the same bytes: files that are there are whole (they get their
-names last) and are kept. `settings.json` is written first and tells whether the files belong to the settings
-at hand; `session.json` is written last and tells that the session is complete.
+An interrupted session is continued with the same bytes: existing files are whole (they get their
+names last) and are kept. `settings.json` is written first: it shows whether the files belong to the current
+settings. `session.json` is written last: it marks the session as complete.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from rol.evaluation import write_tum
 from rol.files import is_used, read_marker, write_bytes, write_text
 from rol.oxford import LIDARS, RadarOdometry, VelodyneRaw
 from rol_sim.session import logs, oxford_files
-from rol_sim.session.settings import SimulationSettings, describe
+from rol_sim.session.settings import SimulationSettings, describe, sensor_settings
 from rol_sim.session.simulation import (
     GPS,
     INS,
@@ -34,7 +34,6 @@ from rol_sim.session.simulation import (
     build_session,
     make_scan,
     make_sweep,
-    sensor_settings,
 )
 
 SCAN_BYTES, SWEEP_BYTES = 470_000, 65_000  # what a file takes on the mean
@@ -87,9 +86,9 @@ def write_session(
     ValueError
         If the folder holds files that were not made by this program.
     OSError
-        If the disk has not the room that the session needs, or is full.
+        If the disk has less free space than the session needs, or is full.
     """
-    sensor_settings(settings)  # faults are told before anything is built
+    sensor_settings(settings)  # report faults before anything is built
     folder = Path(root) / name
     if not _prepare_folder(folder, {"format": FORMAT, **describe(settings, name)}, report):
         return folder
@@ -108,7 +107,7 @@ def write_session(
 
 
 def check_disk_space(folder: Path, session: SimulatedSession) -> str:
-    """Say how much will be written, and refuse if the disk has not the room.
+    """Compute how much will be written; refuse if the disk has too little free space.
 
     Parameters
     ----------
@@ -120,7 +119,7 @@ def check_disk_space(folder: Path, session: SimulatedSession) -> str:
     Returns
     -------
     line : str
-        Numbers of scans and sweeps, size, free room.
+        Numbers of scans and sweeps, size, free space.
 
     Raises
     ------
@@ -136,24 +135,24 @@ def check_disk_space(folder: Path, session: SimulatedSession) -> str:
         f"{needed / 1e9:.2f} GB of them to be written; {free / 1e9:.1f} GB are free"
     )
     if free < needed:
-        raise OSError(errno.ENOSPC, f"not enough room: {line}", str(folder))
+        raise OSError(errno.ENOSPC, f"not enough disk space: {line}", str(folder))
     return line
 
 
 def _write_stretches(
-    folder: Path, session: SimulatedSession, stretches: list[tuple[int, int]], jobs: int
+    folder: Path, session: SimulatedSession, segments: list[tuple[int, int]], jobs: int
 ) -> Iterator[int]:
-    """Write all scans and sweeps; gives how many scans are there after each stretch."""
+    """Write all scans and sweeps; gives how many scans are there after each segment."""
     done = 0
     if jobs <= 1:
-        for first, end in stretches:
-            _write_stretch(folder, session, first, end)
+        for first, end in segments:
+            _write_segment(folder, session, first, end)
             yield end
         return
     context = multiprocessing.get_context("spawn")  # a fork would inherit the ray caster's locks
     given = (folder, session.settings, session.name)
     with ProcessPoolExecutor(jobs, context, initializer=_open_worker, initargs=given) as pool:
-        waiting = {pool.submit(_work, *stretch): stretch for stretch in stretches}
+        waiting = {pool.submit(_work, *segment): segment for segment in segments}
         try:
             for finished in as_completed(waiting):
                 finished.result()
@@ -174,10 +173,10 @@ def _open_worker(folder: Path, settings: SimulationSettings, name: str) -> None:
 
 def _work(first: int, end: int) -> None:
     assert _worker is not None
-    _write_stretch(*_worker, first, end)
+    _write_segment(*_worker, first, end)
 
 
-def _write_stretch(folder: Path, session: SimulatedSession, first: int, end: int) -> None:
+def _write_segment(folder: Path, session: SimulatedSession, first: int, end: int) -> None:
     """Write some scans and the sweeps that begin during them, or before the first and after the last one."""
     n = len(session.scans_us)
     low = session.scans_us[first] if first > 0 else np.iinfo(np.int64).min

@@ -276,7 +276,7 @@ def find_free_plot(
     Returns
     -------
     footprint : array, shape (5,), or None
-        Where it lies, parallel to a street; None if no room was found.
+        Where it lies, parallel to a street; None if no free plot was found.
     """
     streets = builder.plan.streets
     for _ in range(tries):

@@ -1,8 +1,8 @@
-"""A world grown from a flat lidar map: each occupied cell becomes an upright piece of something.
+"""Build a 3D world from a flat lidar map: each occupied cell becomes an upright piece of surface.
 
-A map tells where things stand, not how high they are nor what they are made of. Both are guessed from the
+A map holds places, not heights or materials. Both are guessed from the
 neighbourhood: long and straight is a wall or a house front, scattered is vegetation, small and lonely is a
-pole or a vehicle. A session then finds the world as the world differs from a map of last week. World frame:
+pole or a vehicle. Each session sees the world with some changes against the map. World frame:
 that of the map, z up from the road [m].
 """
 
@@ -39,7 +39,7 @@ PLANT_SPREAD_M = 0.25  # how far leaves and twigs are from where they were, stan
 
 
 class Kind(IntEnum):
-    """What a cell of the map is taken for."""
+    """Class of a map cell."""
 
     FACADE = 0
     WALL = 1
@@ -50,7 +50,7 @@ class Kind(IntEnum):
 
 @dataclass(frozen=True)
 class Cells:
-    """The occupied cells of a map and what they are taken for.
+    """Occupied cells of a map and their classes.
 
     Attributes
     ----------
@@ -70,12 +70,12 @@ class Cells:
     groups: np.ndarray
 
     def take(self, index: np.ndarray) -> Cells:
-        """Give some of the cells."""
+        """Select cells by index."""
         return Cells(self.points[index], self.headings[index], self.kinds[index], self.groups[index])
 
 
 def classify_cells(points: np.ndarray) -> Cells:
-    """Guess from its neighbourhood what stands on each occupied cell of a map.
+    """Classify the occupied cells of a map by their neighbourhoods.
 
     Parameters
     ----------
@@ -203,10 +203,10 @@ def change_cells(
     cells: Cells,
     rng: np.random.Generator,
     *,
-    missing_share: float = 0.05,
+    missing_fraction: float = 0.05,
     plant_spread_m: float = PLANT_SPREAD_M,
 ) -> Cells:
-    """Let time pass since the map was made.
+    """Remove and move cells, as time since the map was made would.
 
     Parameters
     ----------
@@ -214,9 +214,9 @@ def change_cells(
         The map as it was.
     rng : numpy.random.Generator
         Draws the changes.
-    missing_share : float
-        Share of the poles, vehicles and plants that are gone, whole groups of them. Walls and fronts stay,
-        but a fifth of this share of their cells is hidden or open: doors, gates.
+    missing_fraction : float
+        Fraction of the poles, vehicles and plants that are gone, whole groups of them. Walls and fronts stay,
+        but a fifth of this fraction of their cells is hidden or open: doors, gates.
     plant_spread_m : float
         How far leaves and twigs are from where they were, standard deviation [m].
 
@@ -227,24 +227,24 @@ def change_cells(
     """
     n_groups = int(cells.groups.max(initial=-1)) + 1
     is_row = cells.kinds <= Kind.WALL
-    gone = rng.random(n_groups)[cells.groups] < missing_share
-    open_ = rng.random(len(cells.points)) < 0.2 * missing_share
+    gone = rng.random(n_groups)[cells.groups] < missing_fraction
+    open_ = rng.random(len(cells.points)) < 0.2 * missing_fraction
     kept = cells.take(np.flatnonzero(np.where(is_row, ~open_, ~gone)))
     shift = rng.normal(0.0, plant_spread_m, kept.points.shape) * (kept.kinds == Kind.PLANT)[:, None]
     return Cells(kept.points + shift, kept.headings, kept.kinds, kept.groups)
 
 
-def draw_unmapped(cells: Cells, rng: np.random.Generator, *, share: float = 0.1) -> Cells:
-    """Draw what a map does not show: posts, bins, shrubs, things too low or too thin for its maker.
+def draw_unmapped(cells: Cells, rng: np.random.Generator, *, fraction: float = 0.1) -> Cells:
+    """Draw objects that a map does not show: posts, bins, shrubs.
 
     Parameters
     ----------
     cells : Cells
         The whole map.
     rng : numpy.random.Generator
-        Draws them.
-    share : float
-        Groups drawn, as a share of the groups of the map. Each stands some metres from a mapped cell, seven
+        Draws the objects.
+    fraction : float
+        Groups drawn, as a fraction of the groups of the map. Each stands some metres from a mapped cell, seven
         in ten a lonely post, the others shrubs of four to twelve cells.
 
     Returns
@@ -253,7 +253,7 @@ def draw_unmapped(cells: Cells, rng: np.random.Generator, *, share: float = 0.1)
         What stands there besides; the group numbers follow those of the map.
     """
     first = int(cells.groups.max(initial=-1)) + 1
-    n = round(share * len(np.unique(cells.groups)))
+    n = round(fraction * len(np.unique(cells.groups)))
     anchors = cells.points[rng.integers(len(cells.points), size=n)] + rng.normal(0.0, 3.0, (n, 2))
     is_post = rng.random(n) < 0.7
     sizes = np.where(is_post, 1, rng.integers(4, 13, n))
@@ -264,19 +264,19 @@ def draw_unmapped(cells: Cells, rng: np.random.Generator, *, share: float = 0.1)
 
 
 def join_cells(first: Cells, second: Cells) -> Cells:
-    """Put two sets of cells into one; their group numbers are kept."""
+    """Concatenate two sets of cells; their group numbers are kept."""
     return Cells(*(np.concatenate([getattr(first, f.name), getattr(second, f.name)]) for f in fields(Cells)))
 
 
 def build_pieces(cells: Cells, seed: int, *, leaf_density: float = 1.0) -> Mesh:
-    """Raise the cells of a map to upright pieces.
+    """Build upright surfaces from the cells of a map.
 
     Parameters
     ----------
     cells : Cells
         What stands where.
     seed : int
-        Draws heights and shapes; those of a group are the same however many of its cells are asked for.
+        Draws heights and shapes; those of a group are the same however many of its cells are given.
     leaf_density : float
         Leaves on the plants, 1 is usual.
 

@@ -1,4 +1,4 @@
-"""Triangles with a material: what the simulated town is made of, and the simple bodies it is put together from.
+"""Triangle meshes with a material for each triangle.
 
 World frame: x and y span the town's plane, z points up, metres. The ground lies near z = 0.
 """

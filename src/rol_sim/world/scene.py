@@ -91,7 +91,7 @@ class Scene:
         return self._parts[0].mesh
 
     def with_moving(self, meshes: Mesh | Sequence[Mesh]) -> Scene:
-        """Give a scene with the same standing part and these moving bodies.
+        """Return a scene with the same standing part and these moving bodies.
 
         Parameters
         ----------

@@ -57,7 +57,7 @@ class Street:
     trees : float
         Usual distance between street trees, 0 for none [m].
     parking : float
-        Share of the kerb that is marked for parking, 0 .. 1.
+        Fraction of the kerb that is marked for parking, 0 .. 1.
     on_loop : bool
         Whether the sessions' route runs along it.
     """
@@ -76,7 +76,7 @@ class Street:
         return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(self.centre, axis=0), axis=1))])
 
     def place(self, s: np.ndarray | float, offset: np.ndarray | float) -> np.ndarray:
-        """Give poses beside the centre line.
+        """Return poses beside the centre line.
 
         Parameters
         ----------
@@ -248,6 +248,6 @@ def _bend(start: np.ndarray, end: np.ndarray, bow: float, spacing: float = 0.5) 
 
 
 def _on_loop(edges: list[np.ndarray], place: float) -> np.ndarray:
-    """Corner number plus the share of the way to the next corner -> point."""
+    """Corner number plus the fraction of the way to the next corner -> point."""
     edge = edges[int(place) % len(edges)]
     return edge[round((place % 1.0) * (len(edge) - 1))]

@@ -100,11 +100,11 @@ def add_session_objects(
     rng : numpy.random.Generator
         Draws the session.
     parked_share : float
-        Share of the parking places that are taken, 0 .. 1.
+        Fraction of the parking places that are taken, 0 .. 1.
     leaf_density : float
         Leaves on the trees, 1 is usual.
     changed_share : float
-        Share of hedges cut and of street furniture moved, removed or added.
+        Fraction of hedges cut and of street furniture moved, removed or added.
 
     Returns
     -------
