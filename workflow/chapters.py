@@ -27,6 +27,7 @@ ROOT = Path(__file__).resolve().parents[1]
 NOTEBOOKS = ROOT / "notebooks"
 SOURCE = ROOT / "src"  # of all packages
 LOCK = ROOT / "requirements.lock"
+HAVE_DOCSTRING = ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef
 SIMULATOR = "rol_sim"  # writes a simulated session when it is run as a module
 
 # How often a chapter runs: once in all, once for each session, or once for each localization session and method.
@@ -44,18 +45,16 @@ CHAPTERS = {
     "11_ablations": "once",
     "12_performance": "once",
 }
-CONFIG_KEYS = {
-    "profile",
+LISTS, FOLDERS = ("sessions", "methods"), ("sessions_root", "out_dir", "book_dir")
+CONFIG_KEYS = {"profile", *LISTS, *FOLDERS, "seed", "notebooks", "simulated"}
+OPTIONAL_KEYS = {"real_root"}
+SHARED = (
     "sessions_root",
     "sessions",
-    "methods",
     "out_dir",
-    "book_dir",
     "seed",
-    "notebooks",
-    "simulated",
-}
-OPTIONAL_KEYS = {"real_root"}
+    "real_root",
+)  # keys that are parameters of notebooks
 
 
 class ChapterError(ValueError):
@@ -97,14 +96,13 @@ def check_config(config: dict, name: str) -> dict:
     missing, unknown = CONFIG_KEYS - set(config), set(config) - CONFIG_KEYS - OPTIONAL_KEYS
     if missing or unknown:
         raise ChapterError(f"{name}: missing keys {sorted(missing)}, unknown keys {sorted(unknown)}")
-    for key in ("sessions", "methods"):
-        if not isinstance(config[key], list) or not all(
-            word and isinstance(word, str) for word in config[key]
-        ):
+    for key in LISTS:
+        words = config[key]
+        if not isinstance(words, list) or not all(word and isinstance(word, str) for word in words):
             raise ChapterError(f"{name}: `{key}` is no list of names")
     if not config["methods"]:
         raise ChapterError(f"{name}: `methods` is empty")
-    for key in ("sessions_root", "out_dir", "book_dir"):
+    for key in FOLDERS:
         if not isinstance(config[key], str) or Path(config[key]) == Path("."):
             raise ChapterError(f"{name}: `{key}` names no folder of its own: {config[key]!r}")
     strangers = set(config["notebooks"] or {}) - set(CHAPTERS)
@@ -112,7 +110,7 @@ def check_config(config: dict, name: str) -> dict:
         raise ChapterError(f"{name}: no such chapters: {sorted(strangers)}")
     if len(config["sessions"]) < 2 or len(set(config["sessions"])) != len(config["sessions"]):
         raise ChapterError(
-            f"{name}: `sessions` needs at least two different names, the training session first"
+            f"{name}: `sessions` needs two or more different names, the training session first"
         )
     return config
 
@@ -204,19 +202,12 @@ def run_parameters(config: dict, run: Run, notebooks: Path = NOTEBOOKS) -> dict:
     """
     path = notebooks / f"{run.chapter}.ipynb"
     known = notebook_parameters(path)
-    common = {
-        key: config[key]
-        for key in ("sessions_root", "sessions", "out_dir", "seed", "real_root")
-        if key in config
-    }
-    common["in_dir"] = config["out_dir"]
+    common = {key: config[key] for key in SHARED if key in config} | {"in_dir": config["out_dir"]}
     own = {key: value for key, value in (("session", run.session), ("method", run.method)) if value}
     own |= (config["notebooks"] or {}).get(run.chapter) or {}
-    unknown = sorted(set(own) - set(known))
+    unknown = ", ".join(sorted(set(own) - set(known)))
     if unknown:
-        raise ChapterError(
-            f"{path}: has no parameter {', '.join(unknown)}; it has {', '.join(sorted(known))}"
-        )
+        raise ChapterError(f"{path}: has no parameter {unknown}; it has {', '.join(sorted(known))}")
     return {key: value for key, value in (common | own).items() if key in known}
 
 
@@ -229,9 +220,8 @@ def translation(config: dict, notebooks: Path = NOTEBOOKS) -> dict[str, str]:
         ``weights``: file of the network; ``options``: arguments, quoted for the shell.
     """
     chapter = "05_real_vs_fake"
-    known = notebook_parameters(notebooks / f"{chapter}.ipynb") | run_parameters(
-        config, Run(chapter), notebooks
-    )
+    defaults = notebook_parameters(notebooks / f"{chapter}.ipynb")
+    known = defaults | run_parameters(config, Run(chapter), notebooks)
     weights = Path(known["weights_root"], f"{known['network']}.safetensors")
     if known["network"] == "chapter 04":
         weights = Path(config["out_dir"], "pix2pix", "generator.safetensors")
@@ -265,20 +255,22 @@ def code_text(source: str) -> str:
             row, column = token.start
             lines[row - 1] = lines[row - 1][:column]
     for node in ast.walk(ast.parse(source)):
-        if isinstance(
-            node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef
-        ) and ast.get_docstring(node):
+        if isinstance(node, HAVE_DOCSTRING) and ast.get_docstring(node):
             first, last = node.body[0].lineno, node.body[0].end_lineno
             lines[first - 1 : last] = [""] * (last - first + 1)
     return "\n".join(line.rstrip() for line in lines if line.strip())
 
 
-def code_cells(notebook: nbformat.NotebookNode) -> list[str]:
-    """List the sources of a notebook's code cells, without the one that papermill put in."""
+def own_code(notebook: nbformat.NotebookNode) -> list[nbformat.NotebookNode]:
+    """List a notebook's code cells, without empty ones and the one that papermill put in."""
     injected = tagged_cells(notebook, "injected-parameters")
-    return [
-        c.source for c in notebook.cells if c.cell_type == "code" and c.source.strip() and c not in injected
-    ]
+    cells = [cell for cell in notebook.cells if cell.cell_type == "code" and cell.source.strip()]
+    return [cell for cell in cells if cell not in injected]
+
+
+def code_cells(notebook: nbformat.NotebookNode) -> list[str]:
+    """List the sources of a notebook's code cells, without empty ones and the one that papermill put in."""
+    return [cell.source for cell in own_code(notebook)]
 
 
 @cache
@@ -424,18 +416,10 @@ def load_run(path: str | Path, source: str | Path) -> nbformat.NotebookNode:
         raise ChapterError(f"{path}: " + "; ".join(faults))
     if code_cells(executed) != code_cells(current):
         raise ChapterError(f"{path}: its code is not that of {source}; run the chapter again")
+    for cell, done in zip(own_code(current), own_code(executed), strict=True):
+        cell.outputs, cell.execution_count = done.outputs, done.execution_count
     injected = tagged_cells(executed, "injected-parameters")
-    ran = iter(
-        [c for c in executed.cells if c.cell_type == "code" and c.source.strip() and c not in injected]
-    )
-    cells = []
-    for cell in current.cells:
-        if cell.cell_type == "code" and cell.source.strip():
-            done = next(ran)
-            cell.outputs, cell.execution_count = done.outputs, done.execution_count
-        cells.append(cell)
-        if "parameters" in cell.metadata.get("tags", []):
-            cells += injected
-    current.cells = cells
+    place = 1 + current.cells.index(tagged_cells(current, "parameters")[0]) if injected else 0
+    current.cells[place:place] = injected
     current.metadata.setdefault("papermill", {}).update(executed.metadata.get("papermill", {}))
     return current

@@ -38,19 +38,13 @@ def load_list(path: Path = LIST) -> list[dict]:
     return json.loads(path.read_text(encoding="utf-8"))["repositories"]
 
 
-def sha256(path: Path) -> str:
-    """Compute the SHA-256 of a file."""
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
-
-
 def find_faults(folder: Path, files: dict[str, str]) -> dict[str, str]:
     """Name the files of a repository that are missing or have another checksum, each with its fault."""
     faults = {}
     for name, digest in files.items():
         if not (folder / name).is_file():
             faults[name] = "missing"
-        elif sha256(folder / name) != digest:
+        elif hashlib.sha256((folder / name).read_bytes()).hexdigest() != digest:
             faults[name] = "corrupted (another SHA-256 than listed)"
     return faults
 
@@ -148,7 +142,8 @@ def fetch_all(repositories: list[dict], root: Path, url: str) -> list[str]:
         for left in (root / FETCHING).glob("*/"):
             shutil.rmtree(left, ignore_errors=True)  # clone of an interrupted run
         for repository in repositories:
-            print(describe(repository), flush=True)
+            print(f"{repository['repository']}: {repository['content']} ({repository['bytes'] / 1e6:.1f} MB)")
+            print(f"  terms: {repository['terms']}; cite {repository['cite']}", flush=True)
             try:
                 fetch_repository(repository, root, url)
             except FetchError as error:
@@ -170,14 +165,6 @@ def check_all(repositories: list[dict], root: Path) -> list[str]:
     return faults
 
 
-def describe(repository: dict) -> str:
-    """Say what a repository holds, how large it is, and on which terms."""
-    return (
-        f"{repository['repository']}: {repository['content']} ({repository['bytes'] / 1e6:.1f} MB)\n"
-        f"  terms: {repository['terms']}; cite {repository['cite']}"
-    )
-
-
 def main(arguments: list[str] | None = None) -> int:
     """Fetch or check; return 0 if every listed file is there with its checksum, else 1."""
     parser = argparse.ArgumentParser(description="Fetch the small pieces of real data.")
@@ -196,13 +183,9 @@ def main(arguments: list[str] | None = None) -> int:
         faults = ["interrupted; the next run goes on with the files that are missing"]
     except (FetchError, OSError) as error:
         faults = [str(error)]
-    for fault in faults:
-        print(fault, file=sys.stderr)
     if faults:
-        print(
-            f"Not complete ({len(faults)}): `make real` fetches what is missing or corrupted.",
-            file=sys.stderr,
-        )
+        faults.append(f"Not complete ({len(faults)}): `make real` fetches what is missing or corrupted.")
+        print(*faults, sep="\n", file=sys.stderr)
         return 1
     print("All files are there, with the listed checksums.")
     return 0

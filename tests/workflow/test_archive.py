@@ -197,8 +197,8 @@ def test_changed_code_is_refused_and_a_fault_leaves_no_part(
         raise OSError(errno.ENOSPC, "No space left on device")
 
     with monkeypatch.context() as patch:
-        patch.setattr(zipfile.ZipFile, "writestr", full)
-        with pytest.raises(OSError, match=r"cannot write this file: No space left on device: .*tiny\.zip'"):
+        patch.setattr(Path, "write_bytes", full)
+        with pytest.raises(OSError, match=r"cannot write this file: the disk is full: .*tiny\.zip'"):
             pack(project, CONFIG, summary())
     assert os.listdir(project / "build") == ["tiny"]
     (project / "README.md").write_text("changed", encoding="utf-8")

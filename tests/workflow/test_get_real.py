@@ -1,5 +1,6 @@
 """Fetching of the real data from public repositories, tried on local bare repositories."""
 
+import fcntl
 import hashlib
 import json
 import os
@@ -154,7 +155,7 @@ def test_two_runs_at_once_are_refused(public: tuple[str, dict], tmp_path: Path) 
     root = tmp_path / "real"
     (root / get_real.FETCHING).mkdir(parents=True)
     with (root / get_real.FETCHING / "lock").open("w") as lock:
-        get_real.fcntl.flock(lock, get_real.fcntl.LOCK_EX)
+        fcntl.flock(lock, fcntl.LOCK_EX)
         with pytest.raises(FetchError, match="another run is fetching"):
             fetch_all([entry], root, url)
 

@@ -289,7 +289,7 @@ def test_first_picture_is_real_where_it_can_be(
         (book / "images" / name).write_text(name, encoding="utf-8")
     pngs = {"10_real_radar": real, "07_localization": b"simulated"}
     runs = {c: write_run(book / f"{c}.ipynb", f, pngs[c]) for c, f, _ in stage_book.RESULT_FIGURES}
-    monkeypatch.setattr(stage_book, "book_pages", lambda config: runs)
+    monkeypatch.setattr(chapters, "book_pages", lambda config: runs)
     stage_book.stage_result_figure({"out_dir": ""}, book)
     assert (book / "images" / "result.png").read_bytes() == (real or b"simulated")
     assert (book / "picture.md").read_text(encoding="utf-8") == words
@@ -297,7 +297,7 @@ def test_first_picture_is_real_where_it_can_be(
 
 def test_book_without_a_first_picture_is_refused(book: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     runs = {"07": write_run(book / "07_localization.ipynb", "fig-trajectory", None)}
-    monkeypatch.setattr(stage_book, "book_pages", lambda config: runs)
+    monkeypatch.setattr(chapters, "book_pages", lambda config: runs)
     with pytest.raises(ChapterError, match="no PNG figure named fig-trajectory"):
         stage_book.stage_result_figure({"out_dir": ""}, book)
 
@@ -384,7 +384,7 @@ def test_only_captions_of_the_sessions_are_completed(caption: str, data: str, co
     assert notebook.cells[0].metadata.mystnb.figure.caption == completed
 
 
-@pytest.mark.parametrize("metadata", [{}, {"data": "simulated"}])
+@pytest.mark.parametrize("metadata", [{}, {"data": "virtual"}])
 def test_figure_that_does_not_state_its_data_is_refused(metadata: dict) -> None:
     notebook = nbformat.v4.new_notebook(cells=[figure_cell("Errors.", **metadata)])
     with pytest.raises(ChapterError, match="figure fig-a: `data` .* none of session, real, simulated, both"):
