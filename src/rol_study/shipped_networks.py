@@ -284,16 +284,23 @@ def run_network(
         "pairs": {part: len(pairs) for part, pairs in sets.items()},
         "weights": sum(weight.numel() for weight in generator.parameters()),
         "last_run_s": round(seconds, 1),
-        "versions": {package: importlib.metadata.version(package) for package in VERSIONS},
-        "python": platform.python_version(),
-        "machine": platform.machine(),
-        "device": places.device,
+        **describe_environment(places.device),
         "licence": LICENCE,
         "judged": as_lists(evaluated),
         "judged_one_heading": as_lists(one_heading),
         "history": as_lists(history.round(6)),
     }
     return generator, about, card
+
+
+def describe_environment(device: str) -> dict[str, Any]:
+    """Return the versions of packages and of Python, the machine and the device."""
+    return {
+        "versions": {package: importlib.metadata.version(package) for package in VERSIONS},
+        "python": platform.python_version(),
+        "machine": platform.machine(),
+        "device": device,
+    }
 
 
 def as_lists(table: pd.DataFrame) -> dict[str, list[Any]]:
