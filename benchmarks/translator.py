@@ -30,7 +30,7 @@ import rol_beyond.unet  # noqa: F401 (registers the architecture)
 from rol.bev import image_to_points
 from rol.files import write_text
 from rol.pix2pix import TrainConfig, build_generator, generate, has_bf16, load_weights, train_step
-from rol.radar import polar_to_cartesian
+from rol.radar import SDK, polar_to_cartesian
 from rol.similarity import nn_distances
 from rol.training import TrainingState
 from rol_book.parameters import positive
@@ -101,7 +101,7 @@ def warp_with_scipy(codes: np.ndarray, azimuths: np.ndarray) -> np.ndarray:
     axis = np.linspace(63.875, -63.875, 512)
     x, y = np.meshgrid(axis, axis, indexing="ij")
     rows = np.mod(azimuths[0] - np.arctan2(y, x), 2.0 * np.pi) / (azimuths[0] - azimuths[1])
-    bins = np.hypot(x, y) / 0.0432 - 0.5
+    bins = np.hypot(x, y) / SDK.resolution_m - 0.5
     return map_coordinates(codes / 255.0, [rows, bins], order=1, mode="nearest")
 
 

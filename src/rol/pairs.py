@@ -22,7 +22,7 @@ import numpy as np
 try:
     from .bev import image_to_points, normalize_image, points_to_image
     from .files import ImageFolder, write_bytes
-    from .geometry import log
+    from .geometry import check_fields, log
     from .lidar import crop_range, relate_sensors, remove_ground, sweep_to_radar
     from .oxford import EXTRINSICS, RadarOdometry, Session, load_radar, load_sweep
     from .radar import (
@@ -37,7 +37,7 @@ try:
 except ImportError:  # this file was copied on its own
     from bev import image_to_points, normalize_image, points_to_image
     from files import ImageFolder, write_bytes
-    from geometry import log
+    from geometry import check_fields, log
     from lidar import crop_range, relate_sensors, remove_ground, sweep_to_radar
     from oxford import EXTRINSICS, RadarOdometry, Session, load_radar, load_sweep
     from radar import (
@@ -315,7 +315,7 @@ class PairSettings:
     Raises
     ------
     ValueError
-        If the motion is unknown.
+        If the motion is unknown or a value is out of its range; the message names it.
     """
 
     motion: str = "none"
@@ -329,6 +329,14 @@ class PairSettings:
 
     def __post_init__(self) -> None:
         _check_motion(self.motion)
+        allowed = {
+            "(0, inf)": "range_resolution pixel_size",
+            "(0, inf]": "max_range",
+            "(-inf, inf)": "range_offset doppler_seconds",
+            "[-inf, inf)": "min_height",
+            "[1, inf)": "width",
+        }
+        check_fields(self, allowed)
 
     @classmethod
     def from_dict(cls, values: dict[str, Any]) -> PairSettings:

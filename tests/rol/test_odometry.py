@@ -104,7 +104,7 @@ def test_icp_withstands_false_points_and_finds_a_large_motion_from_a_good_guess(
     np.testing.assert_allclose(result.T_target_source, motion, atol=0.02)
 
 
-def test_the_step_is_the_later_pose_seen_from_the_earlier():
+def test_the_increment_is_the_later_pose_in_the_earlier():
     world = posts()
     earlier, later = np.array([1.0, 0.5, 0.1]), np.array([2.0, 0.6, 0.15])
     result = icp_2d(transform_points(invert(later), world), transform_points(invert(earlier), world))
@@ -147,7 +147,7 @@ def test_too_few_iterations_are_flagged():
     assert not result.converged and result.iterations == 2
 
 
-def test_scan_to_scan_icp_follows_steps_too_long_for_a_guess_of_zero():
+def test_scan_to_scan_icp_tracks_increments_too_long_for_a_guess_of_zero():
     # at 4 m a scan the nearest post is the wrong one; the guess of constant velocity finds the right one
     steps = np.tile((1.0, 0.0, 0.02), (12, 1)) * np.linspace(0.5, 4.0, 12)[:, None]
     poses, world = accumulate_increments(steps), posts()
@@ -157,7 +157,7 @@ def test_scan_to_scan_icp_follows_steps_too_long_for_a_guess_of_zero():
     assert np.abs(icp_2d(clouds[-1], clouds[-2]).T_target_source - steps[-1]).max() > 0.5
 
 
-def test_scan_to_scan_icp_goes_on_through_an_empty_cloud():
+def test_scan_to_scan_icp_continues_after_an_empty_cloud():
     world, poses = posts(), accumulate_increments(np.tile((0.5, 0.0, 0.0), (4, 1)))
     clouds = [transform_points(invert(pose), world) for pose in poses]
     clouds[2] = np.zeros((0, 2))
@@ -166,7 +166,7 @@ def test_scan_to_scan_icp_goes_on_through_an_empty_cloud():
     np.testing.assert_allclose(stack_increments(results), np.tile((0.5, 0.0, 0.0), (4, 1)), atol=2e-3)
 
 
-def test_scan_to_scan_icp_of_one_or_no_cloud_has_no_step():
+def test_scan_to_scan_icp_of_one_or_no_cloud_is_empty():
     assert stack_increments(scan_to_scan_icp([posts()])).shape == (0, 3)
     assert stack_increments(scan_to_scan_icp([])).shape == (0, 3)
 

@@ -72,7 +72,7 @@ def test_local_map_keeps_the_mean_of_cells_that_were_seen_twice():
     assert build_local_map([], settings) is None and build_local_map([np.zeros((0, 2))] * 3, settings) is None
 
 
-def test_points_on_a_wall_are_held_across_it_and_let_go_along_it():
+def test_points_on_a_wall_constrain_across_it_only():
     wall = np.column_stack([np.arange(0.0, 10.0, 0.5), 0.5 * np.arange(0.0, 10.0, 0.5)])  # slope one half
     local_map = build_local_map([np.concatenate([wall, [[50.0, 0.0]]])], MapSettings(cell_m=0.25))
     along, across = np.array([2.0, 1.0]) / np.sqrt(5), np.array([-1.0, 2.0]) / np.sqrt(5)
@@ -127,7 +127,7 @@ def test_robust_registration_without_a_match_says_so():
 
 
 class Drive:
-    """A car on a winding way with changing speed, whose radar turns while it drives: the other way round from ours."""
+    """A vehicle on a winding path with changing speed; its scans are distorted by motion and the Doppler effect."""
 
     def __init__(self, n_scans: int = 40, first_s: float = 0.0) -> None:
         self.seconds = np.arange(0.0, 30.0, 1e-3)
@@ -157,34 +157,34 @@ class Drive:
             (3.0 < ranges) & (ranges < 50.0)
         ]
 
-    def clouds(self, false_share: float, seed: int = 0) -> list[np.ndarray]:
-        """One cloud a scan, 5 cm of noise, three quarters of the points each, and false ones among them."""
+    def clouds(self, false_fraction: float, seed: int = 0) -> list[np.ndarray]:
+        """One cloud per scan: 5 cm of noise, three quarters of the points, and false points."""
         rng, clouds = np.random.default_rng(seed), []
         for mid_s in self.mid_s:
             seen = self.scan(mid_s, street())
             seen = seen[rng.random(len(seen)) < 0.75]
             seen += rng.normal(0.0, 0.05, seen.shape)
-            n_false = int(len(seen) * false_share / (1.0 - false_share))
+            n_false = int(len(seen) * false_fraction / (1.0 - false_fraction))
             clouds.append(np.concatenate([seen, rng.uniform(-50.0, 50.0, (n_false, 2))]))
         return clouds
 
     def end_error(self, steps: np.ndarray) -> float:
-        """How far the end is from the true one [m]."""
+        """Compute the position error at the end [m]."""
         end = accumulate_increments(steps, self.truth[0])[-1]
         return float(np.hypot(*(end - self.truth[-1])[:2]))
 
 
-@pytest.mark.parametrize("false_share", [0.0, 0.5, 0.6])
-def test_local_map_odometry_follows_a_car_through_false_points_motion_and_doppler(false_share):
+@pytest.mark.parametrize("false_fraction", [0.0, 0.5, 0.6])
+def test_local_map_odometry_tracks_through_false_points_motion_and_doppler(false_fraction):
     drive = Drive()
-    results = list(local_map_odometry(drive.clouds(false_share), drive.stamps_us))
+    results = list(local_map_odometry(drive.clouds(false_fraction), drive.stamps_us))
     assert [r.fault for r in results] == [""] * 39
     errors = pose_errors(stack_increments(results), relative_pose(drive.truth[:-1], drive.truth[1:]))
     assert rmse(errors.position_m) < 0.12 and rmse(errors.yaw_rad) < np.deg2rad(0.3)
     assert drive.end_error(stack_increments(results)) < 0.5  # of 71 m
 
 
-def test_local_map_odometry_drifts_less_than_the_chain_of_the_paper_and_needs_its_correction():
+def test_local_map_odometry_drifts_less_than_scan_to_scan_icp_and_needs_deskewing():
     drive = Drive()
     clouds = drive.clouds(0.3)
     ours = stack_increments(local_map_odometry(clouds, drive.stamps_us))
@@ -193,7 +193,7 @@ def test_local_map_odometry_drifts_less_than_the_chain_of_the_paper_and_needs_it
     assert drive.end_error(ours) < 0.5 * min(drive.end_error(plain), drive.end_error(paper))
 
 
-def test_clouds_that_are_corrected_already_need_no_correction():
+def test_compensated_clouds_need_no_deskewing():
     drive = Drive(12)
     twists = np.column_stack(
         [
@@ -215,7 +215,7 @@ def test_a_first_velocity_is_found_or_given():
 
 
 @pytest.mark.parametrize("n_gone", [1, 5])
-def test_empty_clouds_are_gone_over_at_constant_velocity_and_the_way_is_found_again(n_gone):
+def test_empty_clouds_are_bridged_at_constant_velocity(n_gone):
     drive = Drive()
     clouds = drive.clouds(0.5)
     clouds[20 : 20 + n_gone] = [np.zeros((0, 2))] * n_gone
@@ -227,7 +227,7 @@ def test_empty_clouds_are_gone_over_at_constant_velocity_and_the_way_is_found_ag
     assert drive.end_error(stack_increments(results)) < 0.6
 
 
-def test_the_local_map_begins_anew_when_nothing_has_matched_for_long():
+def test_the_local_map_is_started_again_after_a_long_time_without_a_match():
     drive = Drive()
     clouds = drive.clouds(0.3)
     clouds[10:24] = [np.zeros((0, 2))] * 14  # 3.5 s
@@ -246,7 +246,7 @@ def test_clouds_without_points_at_the_start_are_waited_for():
     assert [bool(r.fault) for r in results] == [True] * 3 + [False] * 4
 
 
-def test_motions_that_no_car_makes_are_not_believed():
+def test_implausible_motions_are_rejected():
     drive = Drive(20)
     clouds = drive.clouds(0.0)
     clouds[10] = transform_points((1.5, 0.0, 0.0), clouds[10])  # as if seen from 1.5 m farther back
@@ -264,7 +264,7 @@ def test_motions_that_no_car_makes_are_not_believed():
     assert results[9].fault.endswith("% of the points match") and results[9].inlier_ratio < 0.2
 
 
-def test_local_map_odometry_of_one_or_no_cloud_has_no_step():
+def test_local_map_odometry_of_one_or_no_cloud_is_empty():
     assert stack_increments(local_map_odometry([posts()], [0])).shape == (0, 3)
     assert stack_increments(local_map_odometry([], [])).shape == (0, 3)
 
@@ -284,6 +284,6 @@ def test_local_map_odometry_of_one_or_no_cloud_has_no_step():
         ),
     ],
 )
-def test_local_map_odometry_refuses_what_is_no_drive(clouds, stamps_us, fault):
+def test_local_map_odometry_refuses_bad_clouds_and_stamps(clouds, stamps_us, fault):
     with pytest.raises(OdometryError, match=fault):
         list(local_map_odometry(clouds, stamps_us))

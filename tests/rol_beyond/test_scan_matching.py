@@ -32,13 +32,13 @@ def seen_from(pose: tuple[float, float, float], world: np.ndarray) -> np.ndarray
 
 
 @pytest.mark.parametrize("motion", [(1.3, -0.2, 0.03), (-0.9, 0.4, -0.06), (0.0, 0.0, 0.0)])
-def test_search_finds_a_motion_far_from_the_guess(motion: tuple[float, float, float]) -> None:
+def test_correlative_match_finds_a_motion_far_from_the_guess(motion: tuple[float, float, float]) -> None:
     world = thick_street(np.random.default_rng(0))
     found = correlative_scan_match(seen_from(motion, world), seen_from((0.0, 0.0, 0.0), world))
     assert np.hypot(*(found - motion)[:2]) < 0.16 and abs(found[2] - motion[2]) < 0.01
 
 
-def test_search_follows_a_car_that_gains_speed() -> None:
+def test_correlative_match_tracks_an_accelerating_vehicle() -> None:
     world = thick_street(np.random.default_rng(1))
     steps = np.linspace(0.1, 2.2, 8)
     clouds = [seen_from((x, 0.0, 0.0), world) for x in np.concatenate([[0.0], np.cumsum(steps)]) - 9.0]
@@ -50,7 +50,7 @@ def test_search_follows_a_car_that_gains_speed() -> None:
     assert np.abs(plain - steps).max() > np.abs(searched - steps).max()
 
 
-def test_search_without_points_gives_the_guess_and_refuses_bad_ones() -> None:
+def test_correlative_match_without_points_gives_the_guess_and_refuses_bad_ones() -> None:
     cloud, guess = np.random.default_rng(0).normal(size=(20, 2)), np.array([0.5, 0.0, 0.1])
     for source, target in ((np.zeros((0, 2)), cloud), (cloud, np.zeros((0, 2)))):
         np.testing.assert_array_equal(correlative_scan_match(source, target, guess), guess)
@@ -58,7 +58,7 @@ def test_search_without_points_gives_the_guess_and_refuses_bad_ones() -> None:
         correlative_scan_match(np.full((4, 2), np.nan), cloud)
 
 
-def test_search_ignores_stray_points_and_refuses_what_fits_no_grid() -> None:
+def test_correlative_match_ignores_stray_points_and_refuses_what_fits_no_grid() -> None:
     world = thick_street(np.random.default_rng(0))
     source, target = seen_from((1.3, -0.2, 0.03), world), seen_from((0.0, 0.0, 0.0), world)
     stray = np.concatenate([target, [[1e6, 1e6], [-1e6, 0.0]]])
@@ -73,7 +73,7 @@ def test_search_ignores_stray_points_and_refuses_what_fits_no_grid() -> None:
     np.testing.assert_array_equal(correlative_scan_match(source, far, (0.1, 0.0, 0.0)), (0.1, 0.0, 0.0))
 
 
-def test_scan_to_map_icp_holds_the_pose_where_odometry_drifts():
+def test_scan_to_map_icp_corrects_the_drift_of_odometry():
     points, truth = posts(), np.array([(float(x), 0.0, 0.02) for x in range(-15, 15, 2)])
     steps = relative_pose(truth[:-1], truth[1:]) * (0.9, 1.0, 1.0)  # a tenth too short
     clouds = [transform_points(invert(pose), points)[::2] for pose in truth]
@@ -105,7 +105,7 @@ def test_scan_to_map_icp_registers_to_the_near_points_alone():
     assert 0 < len(near) < 10 and results[-1].n_matched == 0  # too few to register to
 
 
-def test_scan_to_map_icp_goes_on_by_the_step_without_points_and_begins_again_where_it_is_set():
+def test_scan_to_map_icp_uses_the_increment_without_points_and_can_be_reset():
     nothing = np.zeros((0, 2))
 
     def reset_callback(index, pose):
@@ -117,7 +117,7 @@ def test_scan_to_map_icp_goes_on_by_the_step_without_points_and_begins_again_whe
     np.testing.assert_allclose(ahead, [0.0, 1.0, 21.0])
 
 
-def test_scan_to_map_icp_does_not_believe_what_hardly_matches():
+def test_scan_to_map_icp_rejects_a_low_inlier_ratio():
     rng, false = np.random.default_rng(1), np.random.default_rng(2)
     cloud = np.concatenate([posts()[:30], false.uniform(100.0, 140.0, (300, 2))])
     settings = ScanToMapSettings(range_m=60.0)
@@ -127,7 +127,7 @@ def test_scan_to_map_icp_does_not_believe_what_hardly_matches():
     assert not result.converged and result.n_matched < 0.2 * len(cloud)
 
 
-def test_scan_to_map_icp_asks_for_a_step_to_each_cloud_and_for_a_map():
+def test_scan_to_map_icp_needs_an_increment_per_cloud_and_a_map():
     with pytest.raises(OdometryError, match="no odometry increment for scan 1"):
         list(scan_to_map_icp([], [np.zeros((0, 2))] * 2, posts(), np.zeros(3)))
     with pytest.raises(OdometryError, match="map: expected points"):
@@ -138,6 +138,6 @@ def test_scan_to_map_icp_asks_for_a_step_to_each_cloud_and_for_a_map():
     ("name", "value"),
     [("window", (-1.0, 1.0, 0.1)), ("window", (1e6, 1.0, 0.1)), ("cell", 0), ("max_points", 0)],
 )
-def test_search_refuses_settings_out_of_range(name: str, value: float):
+def test_correlative_match_refuses_settings_out_of_range(name: str, value: float):
     with pytest.raises(OdometryError, match=f"{name}: .* is not"):
         correlative_scan_match(posts(), posts(), **{name: value})

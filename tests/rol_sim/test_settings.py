@@ -16,6 +16,7 @@ from rol.evaluation import EvaluationError, FailureRule
 from rol.geometry import check_fields
 from rol.mcl import MclError, MclSettings, Measurement, MotionNoise, Resampling
 from rol.odometry import IcpSettings, OdometryError
+from rol.pairs import PairSettings
 from rol.pix2pix import Pix2PixError, TrainConfig
 from rol_beyond.likelihood_field import LikelihoodField
 from rol_beyond.local_map_odometry import MapSettings
@@ -28,6 +29,7 @@ from rol_sim.session.settings import SessionSettings, SettingsError, SimulationS
 from rol_study.sampled_points import FrontEnd, SampledPointsError
 
 NEEDED = {
+    "AdaptationConfig": {"reach_m": 20.0},
     "RecoverySettings": {"reference_contrast": 0.2},
     "SearchSettings": {"reach_m": 30.0},
     "Surface": {"diffuse": 0.1},
@@ -93,8 +95,8 @@ def test_no_number_of_any_settings_may_be_nan(kind: type) -> None:
 def test_the_classes_are_all_there() -> None:
     names = {kind.__name__ for kind in settings_classes()}
     assert names == {
-        "ConfirmationSettings", "DetectionSettings", "FailureRule", "FrontEnd", "IcpSettings", "KldResampling",
-        "LidarSettings", "LikelihoodField", "MapSettings", "MclSettings", "Measurement", "MotionModel", "MotionNoise",
+        "AdaptationConfig", "ConfirmationSettings", "DetectionSettings", "FailureRule", "FrontEnd", "IcpSettings", "KldResampling",
+        "LidarSettings", "LikelihoodField", "MapSettings", "MclSettings", "Measurement", "MotionModel", "MotionNoise", "PairSettings",
         "PlausibilitySettings", "RadarSettings", "RecoverySettings", "RelocalizationSettings", "Resampling",
         "RobustIcpSettings", "ScanToMapSettings", "SearchSettings", "SessionSettings", "SimulationSettings", "Surface",
         "TrainConfig",
@@ -133,10 +135,9 @@ def test_the_classes_are_all_there() -> None:
         (MotionModel, {"outlier_fraction": 2.0}, ValueError, "outlier_fraction: 2.0 is not in"),
         (MapSettings, {"cell_m": -1.0}, ValueError, "cell_m: -1.0 is not in"),
         (FailureRule, {"seconds": -1.0}, EvaluationError, "seconds: -1.0 is not in"),
-        (TrainConfig, {"batch": 0}, Pix2PixError, "batch: 0 is not a whole number in"),
+        (TrainConfig, {"batch_size": 0}, Pix2PixError, "batch_size: 0 is not a whole number in"),
         (TrainConfig, {"beta1": 1.0}, Pix2PixError, "beta1: 1.0 is not in"),
-        (TrainConfig, {"network": "vnet"}, Pix2PixError, "network: 'vnet' is none of resnet, unet"),
-        (TrainConfig, {"pixel_loss": "l2"}, Pix2PixError, "pixel_loss: 'l2' is none of l1, entropy"),
+        (PairSettings, {"pixel_size": 0.0}, ValueError, r"pixel_size: 0.0 is not in \(0, inf\)"),
         (FrontEnd, {"fraction_1m": 40.0}, SampledPointsError, "fraction_1m: 40.0 is not in"),
         (RadarSettings, {"layer_widths_deg": (0.8, 0.0)}, ValueError, "layer_widths_deg: .* is not in"),
         (SimulationSettings, {"loop_m": 10.0}, SettingsError, r"loop_m: 10.0 is not in \[450, inf\)"),
