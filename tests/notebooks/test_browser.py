@@ -164,9 +164,10 @@ def html(profile: dict) -> Path:
 
 
 def pages_of(html: Path) -> list[Path]:
-    """List the pages, without the first, which only leads on, and without the theme's own files."""
+    """List the pages, without the first, which only leads on, and the theme's files; of the pages of code only one."""
     pages = [page for page in sorted(html.rglob("*.html")) if "_static" not in page.relative_to(html).parts]
-    return [page for page in pages if page != html / "index.html"]
+    code = [page for page in pages if "_modules" in page.relative_to(html).parts]
+    return [page for page in pages if page != html / "index.html" and page not in code[1:]]
 
 
 @pytest.fixture(scope="module")
