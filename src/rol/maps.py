@@ -18,11 +18,11 @@ from scipy.spatial import cKDTree
 
 try:
     from .files import write_bytes
-    from .geometry import check_grid, check_poses, compose, transform_points
+    from .geometry import check_grid, check_points, check_poses, compose, transform_points
     from .odometry import IcpSettings, icp_2d
 except ImportError:  # this file was copied into a folder that is no package
     from files import write_bytes
-    from geometry import check_grid, check_poses, compose, transform_points
+    from geometry import check_grid, check_points, check_poses, compose, transform_points
     from odometry import IcpSettings, icp_2d
 
 
@@ -88,9 +88,8 @@ def accumulate_map(
     for i, cloud in enumerate(clouds):
         if i >= len(poses):
             raise MapError(f"more clouds than the {len(poses)} poses")
-        if not np.isfinite(cloud).all():
-            raise MapError(f"cloud {i} holds a point that is not finite")
-        waiting.append(thin_points(transform_points(poses[i], np.reshape(cloud, (-1, 2))), cell)[0])
+        cloud = check_points(cloud, f"cloud {i}", error=MapError)
+        waiting.append(thin_points(transform_points(poses[i], cloud), cell)[0])
         n_clouds, n_waiting = n_clouds + 1, n_waiting + len(waiting[-1])
         if n_waiting > _WAITING_POINTS:  # memory grows with the map, not with the clouds
             _add_points(cells, np.concatenate(waiting), cell)
@@ -302,13 +301,11 @@ def load_map(path: Path | str) -> tuple[np.ndarray, np.ndarray]:
 
 def _check_map(path: Path | str, points: np.ndarray, T_map_session: np.ndarray) -> None:
     """Check that arrays are a map."""
-    if np.ndim(points) != 2 or np.shape(points)[1] != 2 or np.shape(T_map_session) != (3,):
-        shapes = f"{np.shape(points)} and {np.shape(T_map_session)}"
-        raise MapError(f"{path}: expected points (m, 2) and a pose (3,), got {shapes}")
+    check_points(points, str(path), error=MapError)
     if len(points) == 0:
         raise MapError(f"{path}: the map is empty")
-    if not (np.isfinite(points).all() and np.isfinite(T_map_session).all()):
-        raise MapError(f"{path}: a value is not finite")
+    if np.shape(T_map_session) != (3,) or not np.isfinite(T_map_session).all():
+        raise MapError(f"{path}: expected a finite pose (3,), got {T_map_session}")
     check_grid((1, 1), points, str(path), error=MapError)
 
 
