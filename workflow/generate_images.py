@@ -26,15 +26,11 @@ def read_arguments(words: list[str] | None = None) -> argparse.Namespace:
     parser.add_argument("weights", help="file of the network")
     parser.add_argument("out", help="folder of the generated images of the session")
     parser.add_argument(
-        "--threshold", type=int, default=0, help="grey value of a point; 0: that of the network"
+        "--threshold", type=int, default=0, help="grey value of a point; 0: the network's own"
     )
     parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu", help="cpu or cuda")
-    parser.add_argument(
-        "--bf16", choices=BF16, default="auto", help="multiply in bfloat16; auto: where the device can"
-    )
-    parser.add_argument(
-        "--threads", type=positive, default=1, help="threads of the processor; 1 if not given"
-    )
+    parser.add_argument("--bf16", choices=BF16, default="auto", help="use bfloat16; auto: where possible")
+    parser.add_argument("--threads", type=positive, default=1, help="threads of the processor")
     return parser.parse_args(words)
 
 

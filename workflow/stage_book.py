@@ -54,9 +54,8 @@ def fold_parameters(notebook: nbformat.NotebookNode) -> None:
     for tag, words in (("parameters", "parameters"), ("injected-parameters", "parameters of this run")):
         for cell in tagged_cells(notebook, tag):
             cell.metadata["tags"] = [tag, "hide-input"]
-            cell.metadata["mystnb"] = {
-                f"code_prompt_{do.lower()}": f"{do} the {words}" for do in ("Show", "Hide")
-            }
+            show, hide = (f"{do} the {words}" for do in ("Show", "Hide"))
+            cell.metadata["mystnb"] = {"code_prompt_show": show, "code_prompt_hide": hide}
 
 
 def open_with_picture(notebook: nbformat.NotebookNode, images: Path, page: str, kind: str) -> None:
@@ -234,19 +233,18 @@ def launch_settings(environment: Mapping[str, str]) -> dict:
     ChapterError
         If an address is not one that a browser can open.
     """
-    addresses = {
-        "ROL_REPOSITORY_URL": environment.get("ROL_REPOSITORY_URL", ""),
-        "ROL_BINDERHUB_URL": environment.get("ROL_BINDERHUB_URL", "") or "https://mybinder.org",
-    }
-    if not addresses["ROL_REPOSITORY_URL"]:
+    if not environment.get("ROL_REPOSITORY_URL"):
         return {}
-    for name, address in addresses.items():
+    addresses = []
+    for name, default in (("ROL_REPOSITORY_URL", ""), ("ROL_BINDERHUB_URL", "https://mybinder.org")):
+        address = environment.get(name) or default
         if urlsplit(address).scheme not in ("http", "https") or not urlsplit(address).netloc:
             raise ChapterError(f"{name}: not an address that begins with https:// ({address})")
-    repository, hub = (address.rstrip("/").removesuffix(".git") for address in addresses.values())
+        addresses.append(address.rstrip("/").removesuffix(".git"))
+    branch = environment.get("ROL_REPOSITORY_BRANCH") or "main"
     return {
-        "repository": {"url": repository, "branch": environment.get("ROL_REPOSITORY_BRANCH", "") or "main"},
-        "launch_buttons": {"notebook_interface": "jupyterlab", "binderhub_url": hub},
+        "repository": {"url": addresses[0], "branch": branch},
+        "launch_buttons": {"notebook_interface": "jupyterlab", "binderhub_url": addresses[1]},
     }
 
 
@@ -261,17 +259,18 @@ def stage_settings(book: Path, environment: Mapping[str, str]) -> None:
 # ---- generated pages ------------------------------------------------------------------------------------------
 
 
-def git(*words: str) -> str:
-    """Ask git, without minding when there is no repository."""
-    answer = subprocess.run(["git", *words], cwd=ROOT, capture_output=True, encoding="utf-8", check=False)
-    return answer.stdout.strip() if answer.returncode == 0 else ""
-
-
 def commit() -> str:
     """Name the commit of the working tree, where git knows it."""
-    known = git("rev-parse", "HEAD") or "not known (no git repository)"
-    changed = git("status", "--porcelain", "--untracked-files=no")
-    return known + (", with changes that are not committed" if changed else "")
+    words = [
+        "git",
+        "describe",
+        "--always",
+        "--abbrev=40",
+        "--exclude=*",
+        "--dirty=, with changes that are not committed",
+    ]
+    answer = subprocess.run(words, cwd=ROOT, capture_output=True, encoding="utf-8", check=False)
+    return answer.stdout.strip() if answer.returncode == 0 else "not known (no git repository)"
 
 
 def markdown_table(header: list[str], lines: list[list[str]]) -> str:

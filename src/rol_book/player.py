@@ -1,8 +1,7 @@
-"""The projection room: animations for a page, drawn by the browser from a few hundred kilobytes.
+"""Animations for a page, drawn by the browser, with a button and a slider.
 
-A film of thousands of moving dots is large and blurred; the dots themselves are small and sharp. So for the filter the
-page gets the coordinates and a short script that draws them, and for images it gets small pictures, with a button, a
-slider, and nothing loaded from elsewhere.
+A film of thousands of moving dots is large and blurred. So the page holds their coordinates and a short script that
+draws them; of images it holds small compressed ones. Nothing is loaded from elsewhere.
 """
 
 from __future__ import annotations
@@ -27,12 +26,15 @@ COLOURS = {
     "estimate": "#D55E00",
     "truth": "#000000",
 }
-CLOUD_STEP, PARTICLE_STEP, MAP_STEP = 0.35, 0.03, 0.1  # resolution of what is drawn [m]
+CLOUD_STEP, PARTICLE_STEP, MAP_STEP = 0.35, 0.03, 0.1  # resolution of the coordinates [m]
+FILTER_SIZE = 520  # edge of the animation of the filter [pixels]
+MAX_POINTS, MAX_PARTICLES = 400, 120  # larger sets are thinned evenly
+FILTER_FPS, IMAGES_FPS = 8.0, 4.0
 
 
 @dataclass(frozen=True)
 class Frame:
-    """What one picture shows, all in the map frame.
+    """One frame of an animation, all in the map frame.
 
     Attributes
     ----------
@@ -43,7 +45,7 @@ class Frame:
     estimate, truth : array, shape (3,)
         Poses [m, m, rad].
     text : str
-        Words beside the slider.
+        Text beside the slider.
     """
 
     cloud: np.ndarray
@@ -56,17 +58,12 @@ class Frame:
 def play_filter(
     map_points: np.ndarray,
     frames: Sequence[Frame],
-    words: str,
+    description: str,
     *,
     half: float = 40.0,
-    size: int = 520,
-    frames_per_second: float = 8.0,
-    max_points: int = 400,
-    max_particles: int = 120,
     cloud_colour: str = COLOURS["cloud"],
 ) -> str:
-    """Build an animation of the filter as a piece of HTML, the estimate in the middle, x up and y to the
-    left.
+    """Build an animation of the filter as HTML, the estimate in the middle, x up, y left.
 
     Parameters
     ----------
@@ -74,16 +71,10 @@ def play_filter(
         The map [m].
     frames : sequence of Frame
         The pictures, at least one.
-    words : str
-        What is to be seen, for those who cannot see it.
+    description : str
+        Description of the animation for screen readers.
     half : float
         Half the edge of the part of the map that is shown, at most 44 [m].
-    size : int
-        Edge of the picture [pixels].
-    frames_per_second : float
-        Speed.
-    max_points, max_particles : int
-        Of larger clouds and sets only so many are kept, evenly chosen.
     cloud_colour : str
         Colour of the scan's points, "#RRGGBB".
 
@@ -102,15 +93,15 @@ def play_filter(
     reach = max(np.abs(frame.truth[:2] - frames[0].truth[:2]).max() for frame in frames) + half
     origin = frames[0].truth[:2]
     near = map_points[np.abs(map_points - origin).max(axis=1) < reach]
-    clouds = [_pack(_thin(f.cloud, max_points) - f.estimate[:2], CLOUD_STEP, np.int8) for f in frames]
+    clouds = [_pack(_thin(f.cloud, MAX_POINTS) - f.estimate[:2], CLOUD_STEP, np.int8) for f in frames]
     swarms = [
-        _pack(_thin(f.particles[:, :2], max_particles) - f.estimate[:2], PARTICLE_STEP, np.int8)
+        _pack(_thin(f.particles[:, :2], MAX_PARTICLES) - f.estimate[:2], PARTICLE_STEP, np.int8)
         for f in frames
     ]
     data = {
         "half": half,
         "steps": [MAP_STEP, CLOUD_STEP, PARTICLE_STEP],
-        "pause": 1000.0 / frames_per_second,
+        "pause": 1000.0 / FILTER_FPS,
         "colours": {**COLOURS, "cloud": cloud_colour},
         "origin": np.round(origin, 3).tolist(),
         "map": _pack(first_of_cells(near - origin, 0.4), MAP_STEP, np.int16),
@@ -119,38 +110,35 @@ def play_filter(
             for cloud, swarm, f in zip(clouds, swarms, frames, strict=True)
         ],
     }
-    return _page(data, words, size, size, _DRAW_FILTER)
+    return _page(data, description, FILTER_SIZE, FILTER_SIZE, _DRAW_FILTER)
 
 
 def play_images(
     panels: Mapping[str, Sequence[np.ndarray]],
     texts: Sequence[str],
-    words: str,
+    description: str,
     *,
     colours: Mapping[str, str],
     metres_across: float,
     size: int = 320,
-    frames_per_second: float = 4.0,
     quality: int = 40,
 ) -> str:
-    """Build an animation of images side by side as a piece of HTML, the car in the middle of each, driving up.
+    """Build an animation of images side by side as HTML, the car in the middle of each, driving up.
 
     Parameters
     ----------
     panels : mapping of str to sequence of array, shape (h, h), uint8
         The images of each panel in the order of time, by its title.
     texts : sequence of str
-        Words beside the slider, for each time.
-    words : str
-        What is to be seen, for those who cannot see it.
+        Text beside the slider, for each time.
+    description : str
+        Description of the animation for screen readers.
     colours : mapping of str to str
         Panels that are drawn in one colour, "#RRGGBB", wherever they are not 0; the others are grey, dark on white.
     metres_across : float
         Edge of what an image shows [m].
     size : int
         Edge of a panel [pixels]; images are stored no larger.
-    frames_per_second : float
-        Speed.
     quality : int
         Of the grey images, 1 to 100; they are kept as JPEG, the others without loss.
 
@@ -174,7 +162,7 @@ def play_images(
         for title, images in panels.items()
     ]
     data = {
-        "pause": 1000.0 / frames_per_second,
+        "pause": 1000.0 / IMAGES_FPS,
         "size": size,
         "across": metres_across,
         "titles": list(panels),
@@ -182,11 +170,11 @@ def play_images(
     }
     gap, head = 12, 34
     width = len(panels) * (size + gap) - gap
-    return _page({**data, "gap": gap, "head": head}, words, width, size + head, _DRAW_IMAGES)
+    return _page({**data, "gap": gap, "head": head}, description, width, size + head, _DRAW_IMAGES)
 
 
 def _encode(image: np.ndarray, colour: str | None, size: int, quality: int) -> str:
-    """Write an image as an address that holds it: JPEG of its greys, dark on white, or PNG in one colour."""
+    """Encode an image as a data URL: JPEG of its greys, dark on white, or PNG in one colour."""
     image = np.asarray(image)
     if image.ndim != 2 or image.dtype != np.uint8:
         raise ValueError(
@@ -205,12 +193,12 @@ def _encode(image: np.ndarray, colour: str | None, size: int, quality: int) -> s
     return f"data:image/{kind};base64,{base64.b64encode(coded.tobytes()).decode()}"
 
 
-def _page(data: dict, words: str, width: int, height: int, draw: str) -> str:
-    """Put data and the script that draws them together with button and slider."""
+def _page(data: dict, description: str, width: int, height: int, draw: str) -> str:
+    """Return the HTML of an animation: data, drawing script, button and slider."""
     text = json.dumps(data, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
     return _PAGE.substitute(
         name="player-" + hashlib.sha256(text.encode()).hexdigest()[:10],
-        words=html.escape(words),
+        description=html.escape(description),
         width=width,
         height=height,
         last=len(data["frames"]) - 1,
@@ -220,22 +208,22 @@ def _page(data: dict, words: str, width: int, height: int, draw: str) -> str:
 
 
 def _thin(points: np.ndarray, most: int) -> np.ndarray:
-    """Keep at most so many points, evenly chosen."""
+    """Keep at most `most` points, evenly chosen."""
     points = np.asarray(points, dtype=np.float64)
     return points if len(points) <= most else points[np.linspace(0, len(points) - 1, most).astype(int)]
 
 
 def _pack(points: np.ndarray, step: float, kind: type) -> str:
-    """Round to steps, drop what the kind of integer cannot hold, and write as base64."""
+    """Quantize coordinates, discard those beyond the integer type, and encode them as base64."""
     if not np.isfinite(points).all():
-        raise ValueError("a point to be drawn is not finite")
+        raise ValueError("a point of the animation is not finite")
     steps = np.round(points / step)
     steps = steps[(np.abs(steps) <= np.iinfo(kind).max).all(axis=1)]
     return base64.b64encode(steps.astype(kind).tobytes()).decode()
 
 
 _PAGE = Template("""<div id="$name" style="max-width: ${width}px">
-<canvas width="$width" height="$height" role="img" aria-label="$words" style="width: 100%"></canvas>
+<canvas width="$width" height="$height" role="img" aria-label="$description" style="width: 100%"></canvas>
 <div style="display: flex; gap: 0.6em; align-items: center">
 <button type="button" aria-label="play or pause" style="width: 3em">&#9654;</button>
 <input type="range" min="0" max="$last" value="0" aria-label="time" style="flex: 1">

@@ -1,4 +1,4 @@
-"""The drawing room: every figure of the book that more than one line makes. Nothing here computes a result.
+"""Figures of the book. Nothing here computes a result.
 
 Functions take an ``ax`` (or a figure), draw into it and return it; nothing is shown or saved. Pictures of the
 ground have x (forward) up and y (left) to the left, in metres, with the sensor or the map's origin at zero.
@@ -14,7 +14,7 @@ from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.quiver import Quiver
 
-# Told apart by the colour-blind, and on grey paper by their lightness (Okabe and Ito 2008).
+# Distinct for colour-blind readers, and by lightness on grey paper (Okabe and Ito 2008).
 COLOURS = {
     "radar": "#E69F00",
     "fake": "#009E73",
@@ -24,7 +24,7 @@ COLOURS = {
     "estimate": "#D55E00",
 }
 
-# For sessions, in this order: told apart by the colour-blind too, and from all of the above.
+# For sessions, in this order: distinct for colour-blind readers too, and from all of the above.
 SESSION_COLOURS = ("#332288", "#33BBEE", "#EE3377", "#999933", "#7F3B08")
 
 # For other lines side by side, in this order.
@@ -32,7 +32,7 @@ SERIES = ("#000000", "#0072B2", "#E69F00", "#009E73", "#D55E00", "#CC79A7")
 
 
 def style() -> None:
-    """Set matplotlib's defaults for the book: sizes that read well at 700 pixels, quiet lines."""
+    """Set matplotlib's defaults for the book: readable at a width of 700 pixels, thin lines."""
     plt.rcParams.update(
         {
             "figure.dpi": 120,
@@ -59,8 +59,7 @@ def style() -> None:
     )
 
 
-# ---- images in metres
-# -------------------------------------------------------------------------------------------
+# ---- images in metres ----
 
 
 def show_image(
@@ -83,11 +82,11 @@ def show_image(
     pixel_size : float
         Edge of a pixel [m].
     title : str
-        Words above.
+        Title.
     vmax : float, optional
         Value of the darkest colour; the image's largest if not given.
     cmap : str
-        Colour map; dark on white unless told otherwise.
+        Colour map; dark on white if not given.
 
     Returns
     -------
@@ -121,7 +120,7 @@ def show_points(
     points : array, shape (n, 2) or more columns
         x forward, y left [m].
     colour, label, title : str
-        Colour of the points, their name in a legend, words above.
+        Colour of the points, their name in a legend, title.
     size, alpha : float
         Area of a point [square points] and its opacity.
 
@@ -164,7 +163,7 @@ def zoom(ax: Axes, centre: Sequence[float], half: float) -> Axes:
 
 
 def frame_square(ax: Axes, centre: Sequence[float], half: float, colour: str = COLOURS["estimate"]) -> Axes:
-    """Draw the outline of a square of the ground, to say where an enlarged view lies."""
+    """Draw the outline of a square of the ground, the place of an enlarged view."""
     x, y = centre
     ax.plot(
         [y + half, y - half, y - half, y + half, y + half],
@@ -174,8 +173,7 @@ def frame_square(ax: Axes, centre: Sequence[float], half: float, colour: str = C
     return ax
 
 
-# ---- alignment and ground (chapters 02 and 03)
-# ------------------------------------------------------------------
+# ---- alignment and ground ----
 
 
 def draw_gaps(ax: Axes, gaps_ms: Mapping[str, np.ndarray], *, max_gap_ms: float, title: str = "") -> Axes:
@@ -188,9 +186,9 @@ def draw_gaps(ax: Axes, gaps_ms: Mapping[str, np.ndarray], *, max_gap_ms: float,
     gaps_ms : mapping of str to array, shape (n,)
         Per lidar its sweep's time minus the scan's [ms].
     max_gap_ms : float
-        Gaps beyond it are refused [ms].
+        Limit of the gaps [ms].
     title : str
-        Words above.
+        Title.
 
     Returns
     -------
@@ -223,7 +221,7 @@ def draw_with_bins(
     edges : array, shape (k + 1,)
         Edges of the bins; bins of fewer than three pairs get no median.
     colour, label, marker : str
-        How the line looks and its name in a legend.
+        Look of the line and its name in a legend.
 
     Returns
     -------
@@ -293,7 +291,7 @@ def draw_overlay(
     size : float
         Area of a point [square points].
     title : str
-        Words above.
+        Title.
     pixel_size : float
         Edge of a pixel [m].
 
@@ -307,8 +305,7 @@ def draw_overlay(
     return zoom(ax, (0.0, 0.0), radar_image.shape[0] * pixel_size / 2.0)
 
 
-# ---- maps and localization (chapters 06 to 08)
-# --------------------------------------------------------------------
+# ---- maps and localization ----
 
 
 def draw_track(
@@ -321,14 +318,14 @@ def draw_track(
     vmax: float | None = None,
     linewidth: float = 1.6,
 ) -> Axes | LineCollection:
-    """Draw a way on the ground: x up, y to the left.
+    """Draw a path on the ground: x up, y to the left.
 
     Parameters
     ----------
     ax : Axes
         Where to draw.
     poses : array, shape (n, 2) or (n, 3)
-        Places along the way [m].
+        Places along the path [m].
     colour, label : str
         Colour of the line and its name in a legend.
     values : array, shape (n,), optional
@@ -422,7 +419,7 @@ def draw_result_row(
     max_m: float = 5.0,
     max_deg: float = 5.0,
 ) -> Sequence[Axes]:
-    """Draw one row of the paper's Fig. 4: ways, position errors, heading errors.
+    """Draw one row of the paper's Fig. 4: paths, position errors, heading errors.
 
     Parameters
     ----------
@@ -440,7 +437,7 @@ def draw_result_row(
     axes : sequence of three Axes
         The axes.
     """
-    draw_track(axes[0], truth, colour=COLOURS["truth"], label="truth", linewidth=2.6)
+    draw_track(axes[0], truth, colour=COLOURS["truth"], label="ground truth", linewidth=2.6)
     draw_track(axes[0], estimate, colour=COLOURS["estimate"], label="estimate", linewidth=1.1)
     axes[0].legend(loc="best", fontsize=8.5)
     share = 100.0 / len(position_m)
@@ -461,8 +458,7 @@ def draw_result_row(
     return axes
 
 
-# ---- the translator (chapters 04 and 05)
-# ------------------------------------------------------------------------------------------
+# ---- the network ----
 
 
 def draw_losses(
@@ -514,7 +510,7 @@ def draw_losses(
         markersize=3,
         label="discriminator",
     )
-    right.axhline(np.log(2.0), color=COLOURS["map"], linestyle="--", label="D cannot tell")
+    right.axhline(np.log(2.0), color=COLOURS["map"], linestyle="--", label="D undecided")
     right.set(title="adversarial losses (Eq. 3)", xlabel="step", ylabel="cross-entropy", ylim=(0.0, None))
     for ax in axes:
         ax.legend(loc="best")
@@ -539,9 +535,9 @@ def draw_image_grid(
     images : n sequences of m arrays, shape (h, h)
         Images.
     titles : sequence of str, length m
-        Words above the columns.
+        Titles of the columns.
     rows : sequence of str, length n
-        Words left of the rows.
+        Labels left of the rows.
     half : float
         Half the edge of the square shown [m].
     vmax : sequence of float, length m
@@ -552,16 +548,16 @@ def draw_image_grid(
     axes : array of Axes
         The axes.
     """
-    for row, (line, words) in enumerate(zip(images, rows, strict=True)):
+    for row, (line, label) in enumerate(zip(images, rows, strict=True)):
         for column, (image, darkest) in enumerate(zip(line, vmax, strict=True)):
             ax = zoom(show_image(axes[row, column], image, vmax=darkest), (0.0, 0.0), half)
-            ax.set(title=titles[column] if row == 0 else "", xlabel="", ylabel=words if column == 0 else "")
+            ax.set(title=titles[column] if row == 0 else "", xlabel="", ylabel=label if column == 0 else "")
             ax.set(xticks=[], yticks=[])
             ax.spines[:].set_visible(True)
     return axes
 
 
-def draw_distances(ax: Axes, counts: np.ndarray, edges: np.ndarray, *, words: str = "") -> Axes:
+def draw_distances(ax: Axes, counts: np.ndarray, edges: np.ndarray, *, text: str = "") -> Axes:
     """Draw the distribution of nearest-neighbour distances, with levels at 1 m and 2 m.
 
     Parameters
@@ -572,8 +568,8 @@ def draw_distances(ax: Axes, counts: np.ndarray, edges: np.ndarray, *, words: st
         Points per bin; the last bin holds all beyond.
     edges : array, shape (k + 1,)
         Edges of the bins [m].
-    words : str
-        Words into the upper right corner.
+    text : str
+        Text in the upper right corner.
 
     Returns
     -------
@@ -583,7 +579,7 @@ def draw_distances(ax: Axes, counts: np.ndarray, edges: np.ndarray, *, words: st
     ax.stairs(100.0 * counts / max(counts.sum(), 1), edges, fill=True, color=COLOURS["fake"])
     for level in (1.0, 2.0):
         ax.axvline(level, color="#444444", linewidth=0.9, linestyle="--")
-    ax.text(0.97, 0.95, words, transform=ax.transAxes, ha="right", va="top", fontsize=9.5)
+    ax.text(0.97, 0.95, text, transform=ax.transAxes, ha="right", va="top", fontsize=9.5)
     ax.set(xlim=(edges[0], edges[-1]), xlabel="distance to the nearest real point [m]", ylabel="points [%]")
     return ax
 
@@ -617,17 +613,17 @@ def draw_dots(ax: Axes, values: Sequence[np.ndarray], names: Sequence[str], *, c
     return ax
 
 
-# ---- sessions (chapter 01) ----
+# ---- sessions ----
 
 
-def draw_routes(ax: Axes, ways: Sequence[np.ndarray], names: Sequence[str]) -> Axes:
-    """Draw the ways of several sessions on the ground, a dot at each start.
+def draw_routes(ax: Axes, paths: Sequence[np.ndarray], names: Sequence[str]) -> Axes:
+    """Draw the paths of several sessions on the ground, a dot at each start.
 
     Parameters
     ----------
     ax : Axes
         Where to draw.
-    ways : sequence of array, shape (n, 2)
+    paths : sequence of array, shape (n, 2)
         East and north of each session [m].
     names : sequence of str
         Names for the legend.
@@ -637,10 +633,10 @@ def draw_routes(ax: Axes, ways: Sequence[np.ndarray], names: Sequence[str]) -> A
     ax : Axes
         The axes.
     """
-    for index, (way, name) in enumerate(zip(ways, names, strict=True)):
+    for index, (path, name) in enumerate(zip(paths, names, strict=True)):
         colour = SESSION_COLOURS[index % len(SESSION_COLOURS)]
-        ax.plot(way[:, 0], way[:, 1], color=colour, linewidth=1.4, label=name)
-        ax.plot(*way[0], "o", color=colour, markersize=5)
+        ax.plot(path[:, 0], path[:, 1], color=colour, linewidth=1.4, label=name)
+        ax.plot(*path[0], "o", color=colour, markersize=5)
     ax.set_aspect("equal", adjustable="datalim")
     ax.set(title="positions of gps.csv", xlabel="east [m]", ylabel="north [m]")
     return ax
@@ -756,7 +752,7 @@ def draw_view(ax: Axes, picture: np.ndarray, *, title: str = "") -> Axes:
     picture : array, shape (h, w, 3)
         Colours between 0 and 1.
     title : str
-        Words above.
+        Title.
 
     Returns
     -------
@@ -775,11 +771,11 @@ def draw_plan(
     centre: Sequence[float],
     half: float,
     *,
-    way: np.ndarray,
+    path: np.ndarray,
     pose: np.ndarray,
     title: str = "",
 ) -> Axes:
-    """Show a rendered plan with a way on it and one pose as an arrow.
+    """Show a rendered plan with a path on it and one pose as an arrow.
 
     Parameters
     ----------
@@ -791,12 +787,12 @@ def draw_plan(
         Middle of the plan [m].
     half : float
         Half its edge [m].
-    way : array, shape (n, 3)
-        Poses along the way [m, m, rad].
+    path : array, shape (n, 3)
+        Poses along the path [m, m, rad].
     pose : array, shape (3,)
-        The pose to point out.
+        The pose of the arrow.
     title : str
-        Words above.
+        Title.
 
     Returns
     -------
@@ -805,7 +801,7 @@ def draw_plan(
     """
     extent = (centre[0] - half, centre[0] + half, centre[1] - half, centre[1] + half)
     ax.imshow(picture, extent=extent, interpolation="antialiased")
-    ax.plot(way[:, 0], way[:, 1], color=COLOURS["truth"], linewidth=1.8)
+    ax.plot(path[:, 0], path[:, 1], color=COLOURS["truth"], linewidth=1.8)
     shape = "simple, head_width=1.0, head_length=0.8, tail_width=0.3"
     arrow = {"arrowstyle": shape, "mutation_scale": 18, "facecolor": COLOURS["truth"], "edgecolor": "white"}
     tip = pose[:2] + 16.0 * np.array([np.cos(pose[2]), np.sin(pose[2])])

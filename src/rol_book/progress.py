@@ -1,7 +1,6 @@
-"""A bar for work that takes long, shown where a person watches and nowhere else.
+"""A progress bar for long work, shown only in a terminal and in a notebook that is open in Jupyter.
 
-A notebook that papermill runs is kept with all that its cells write, and a log is read line by line: a bar would litter
-both. So it appears in a terminal and in a notebook that is open in Jupyter, and goes when the work is done.
+Notebooks that papermill runs are stored with their outputs, and logs are read line by line: a bar would clutter both.
 """
 
 from __future__ import annotations
@@ -11,36 +10,37 @@ import sys
 from collections.abc import Iterable, Iterator
 from typing import TypeVar
 
+try:
+    from tqdm import tqdm
+except ImportError:  # without tqdm no bar is shown
+    tqdm = None
+
 T = TypeVar("T")
 
 
 def is_watched() -> bool:
-    """Say whether a person sees a bar move: standard error is a terminal, or Jupyter's server started this kernel."""
+    """Return whether a bar would be seen: standard error is a terminal, or Jupyter started this kernel."""
     return sys.stderr.isatty() or "JPY_SESSION_NAME" in os.environ
 
 
-def track(items: Iterable[T], words: str, total: int | None = None) -> Iterator[T]:
-    """Go through items, with a bar where a person watches and tqdm is installed.
+def track(items: Iterable[T], label: str, total: int | None = None) -> Iterator[T]:
+    """Iterate over items, with a progress bar where it is seen and tqdm is installed.
 
     Parameters
     ----------
     items : iterable
-        What is gone through; a generator does its work meanwhile.
-    words : str
-        What the bar says before itself.
+        The items; a generator does its work meanwhile.
+    label : str
+        Text before the bar.
     total : int, optional
-        Number of items, where they do not know it themselves.
+        Number of items, for iterables without a length.
 
     Yields
     ------
     item : object
         The items.
     """
-    try:
-        from tqdm import tqdm
-    except ImportError:
-        tqdm = None
     if tqdm is None or not is_watched():
         yield from items
     else:
-        yield from tqdm(items, desc=words, total=total, leave=False)
+        yield from tqdm(items, desc=label, total=total, leave=False)

@@ -38,7 +38,7 @@ def forbidden_codes() -> np.ndarray:
     return np.setdiff1d(np.arange(24), reachable).astype(np.uint8)
 
 
-def brightness_fractions(
+def _brightness_fractions(
     codes: np.ndarray, codes_from: tuple[int, ...] = BRIGHTNESS_CODES
 ) -> dict[int, float]:
     """Compute the fraction of pixels at or above each code.
@@ -122,7 +122,7 @@ def zero_fractions(
     return fractions
 
 
-def noise_correlation(codes: np.ndarray, lags: int = 7, bins: tuple[int, int] = (700, 1100)) -> list[float]:
+def _noise_correlation(codes: np.ndarray, lags: int = 7, bins: tuple[int, int] = (700, 1100)) -> list[float]:
     """Estimate the correlation of noise along the range, in quiet bins.
 
     Parameters
@@ -192,7 +192,7 @@ def near_field(codes: np.ndarray, ranges_m: tuple[float, ...] = NEAR_RANGES_M) -
     return {r: float(scans[:, round(r / MEASURED.resolution_m)].mean()) for r in ranges_m}
 
 
-def floor_by_peak(codes: np.ndarray, edges: tuple[int, ...] = PEAK_EDGES) -> dict[str, float]:
+def _floor_by_peak(codes: np.ndarray, edges: tuple[int, ...] = PEAK_EDGES) -> dict[str, float]:
     """Compute the noise floor at far range, for rows grouped by their strongest return.
 
     Parameters
@@ -356,21 +356,21 @@ def scan_statistics(codes: np.ndarray) -> dict:
     near = _rows(codes)[:, :5]
     return {
         "histogram": code_histogram(codes),
-        "fractions": brightness_fractions(codes),
-        "fractions_40_by_range": fractions_by_range(codes, 40),
+        "fractions": _brightness_fractions(codes),
+        "fractions_40_by_range": _fractions_by_range(codes, 40),
         "zero_fractions": zero_fractions(codes),
-        "range_correlation": noise_correlation(codes),
+        "range_correlation": _noise_correlation(codes),
         "azimuth_correlation": azimuth_correlation(codes),
         "near_field": near_field(codes),
         "near_copies": bool((near == near[:, :1]).all()),
-        "floors": floor_by_peak(codes),
+        "floors": _floor_by_peak(codes),
         "point_spread": point_spread(codes),
         "forbidden": int(np.isin(codes, forbidden_codes()).sum()),
         "greatest": int(codes.max()),
     }
 
 
-def fractions_by_range(
+def _fractions_by_range(
     codes: np.ndarray, code: int, edges_m: tuple[float, ...] = (2.5, 5, 10, 20, 30, 50, 80, 110, 165)
 ) -> dict:
     """Compute the fraction of pixels at or above a code, ring by ring.

@@ -164,9 +164,10 @@ def html(profile: dict) -> Path:
 
 
 def pages_of(html: Path) -> list[Path]:
-    """List the pages, without the first, which only leads on, and without the theme's own files."""
+    """List the pages, without the first, which only leads on, and the theme's files; of the pages of code only one."""
     pages = [page for page in sorted(html.rglob("*.html")) if "_static" not in page.relative_to(html).parts]
-    return [page for page in pages if page != html / "index.html"]
+    code = [page for page in pages if "_modules" in page.relative_to(html).parts]
+    return [page for page in pages if page != html / "index.html" and page not in code[1:]]
 
 
 @pytest.fixture(scope="module")
@@ -175,20 +176,25 @@ def surveys() -> dict[Path, list[Visit]]:
     return {}
 
 
+@pytest.fixture(scope="module")
+def known() -> set[str]:
+    """Combinations of colours and size that a page of any book has had, with its fault if they have one."""
+    return set()
+
+
 @pytest.fixture
-def visits(html: Path, executable: str, surveys: dict[Path, list[Visit]]) -> list[Visit]:
+def visits(html: Path, executable: str, surveys: dict[Path, list[Visit]], known: set[str]) -> list[Visit]:
     if html not in surveys:
         addresses = [page.as_uri() for page in pages_of(html)]
         shares = [addresses[k::BROWSERS] for k in range(BROWSERS)]
         with ThreadPoolExecutor(BROWSERS) as pool:
-            visits = pool.map(survey, [executable] * BROWSERS, shares)
+            visits = pool.map(lambda share: survey(executable, share, known), shares)
             surveys[html] = [visit for share in visits for visit in share]
     return surveys[html]
 
 
-def survey(executable: str, addresses: list[str]) -> list[Visit]:
+def survey(executable: str, addresses: list[str], known: set[str]) -> list[Visit]:
     """Visit pages in a browser of their own; every second one is loaded narrow and dark, then made wide and light."""
-    known: set[str] = set()
     with launch(executable) as tab:
         return [
             visit
@@ -425,7 +431,7 @@ def test_browser_that_does_not_start_says_so(tmp_path: Path) -> None:
     program.write_text("#!/bin/sh\necho no display today\n", encoding="utf-8")
     program.chmod(0o755)
     with ThreadPoolExecutor() as pool, pytest.raises(Error, match="no display today"):
-        pool.submit(survey, str(program), []).result()
+        pool.submit(survey, str(program), [], set()).result()
 
 
 def test_browser_is_found_by_the_environment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,9 +1,10 @@
-"""The bar: what goes through it stays as it is, and it is seen where somebody watches and nowhere else."""
+"""The progress bar: items pass unchanged, and it is shown in terminals and in Jupyter only."""
 
 import sys
 
 import pytest
 
+from rol_book import progress
 from rol_book.progress import is_watched, track
 
 
@@ -24,9 +25,9 @@ def test_the_bar_is_seen_in_jupyter_and_goes_at_the_end(
 ) -> None:
     monkeypatch.setenv("JPY_SESSION_NAME", "notebooks/05_real_vs_fake.ipynb")
     assert list(track((k for k in range(3)), "scans", total)) == [0, 1, 2]
-    told = capsys.readouterr()
-    assert told.out == "" and "scans" in told.err
-    assert told.err.endswith("\r") and not told.err.rsplit("\r", 2)[1].strip()  # wiped
+    shown = capsys.readouterr()
+    assert shown.out == "" and "scans" in shown.err
+    assert shown.err.endswith("\r") and not shown.err.rsplit("\r", 2)[1].strip()  # wiped
 
 
 def test_the_bar_is_seen_in_a_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -42,6 +43,6 @@ def test_items_are_asked_for_one_by_one() -> None:
 
 def test_without_tqdm_there_is_no_bar(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture) -> None:
     monkeypatch.setenv("JPY_SESSION_NAME", "a.ipynb")
-    monkeypatch.setitem(sys.modules, "tqdm", None)
+    monkeypatch.setattr(progress, "tqdm", None)
     assert list(track(range(3), "scans")) == [0, 1, 2]
     assert capsys.readouterr() == ("", "")

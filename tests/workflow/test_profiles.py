@@ -1,14 +1,11 @@
 """What must hold of the cluster profiles, and of the files that go with the project: hooks, changelog, Binder."""
 
-import argparse
-import importlib.util
 import os
 import re
 import shlex
 import subprocess
 import sys
 from pathlib import Path
-from types import ModuleType
 
 import pytest
 import yaml
@@ -139,56 +136,58 @@ def test_script_that_tries_slurm_is_a_script() -> None:
 # ---- jobs of Kubernetes ---------------------------------------------------------------------------------------
 
 
-@pytest.fixture(scope="module")
-def submit() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("submit", PROFILES / "kubernetes/submit.py")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+def submit(folder: Path, gpus: int = 0, mount: Path | None = None) -> subprocess.CompletedProcess:
+    """Hand a job in from a folder with the command of the profile and a stand-in for kubectl, which prints the manifest."""
+    kubectl = folder.parent / "kubectl"
+    kubectl.write_text("#!/bin/sh\ncat\n", encoding="utf-8")
+    kubectl.chmod(0o755)
+    command = load_profile("kubernetes")["cluster-generic-submit-cmd"]
+    values = {"rule": "real_vs_fake", "threads": "2", "resources.mem_mb": "8000", "resources.runtime": "90"}
+    for name, value in (values | {"resources.gpu": str(gpus)}).items():
+        assert f"{{{name}}}" in command
+        command = command.replace(f"{{{name}}}", value)
+    words = shlex.split(command.replace("MOUNT=/volume", f"MOUNT={mount or folder.parent}"))
+    assert (ROOT / words[-1]).is_file()
+    command = [*words[:-1], ROOT / words[-1], folder / "job.sh"]
+    environment = os.environ | {"PATH": f"{folder.parent}:{os.environ['PATH']}"}
+    return subprocess.run(command, cwd=folder, env=environment, check=False, capture_output=True, text=True)
 
 
 @pytest.fixture
-def given(submit: ModuleType) -> argparse.Namespace:
-    """The command line of the profile, filled as Snakemake fills it."""
-    command = load_profile("kubernetes")["cluster-generic-submit-cmd"]
-    values = {
-        "{rule}": "real_vs_fake",
-        "{threads}": "2",
-        "{resources.mem_mb}": "8000",
-        "{resources.runtime}": "90",
-        "{resources.gpu}": "0",
-    }
-    for name, value in values.items():
-        assert name in command
-        command = command.replace(name, value)
-    words = shlex.split(command)
-    assert (ROOT / words[1]).is_file()
-    return submit.read_arguments([*words[2:], "/volume/book/.snakemake/job.sh"])
+def folder(tmp_path: Path) -> Path:
+    """A folder on the volume, with a name that YAML would misread without quotes."""
+    (tmp_path / "a: 'b' #c").mkdir()
+    return tmp_path / "a: 'b' #c"
 
 
-def test_job_runs_its_script_on_the_volume(submit: ModuleType, given: argparse.Namespace) -> None:
-    job = submit.manifest(given, Path("/volume/book"))
+def test_job_runs_its_script_on_the_volume(folder: Path) -> None:
+    job = yaml.safe_load(submit(folder).stdout)
+    assert (job["apiVersion"], job["kind"]) == ("batch/v1", "Job")
     assert re.fullmatch(r"[a-z0-9-]+", job["metadata"]["generateName"])
+    assert job["metadata"]["labels"] == {"app": "radar-on-lidar", "rule": "real-vs-fake"}
     pod = job["spec"]["template"]["spec"]
     container = pod["containers"][0]
-    assert container["command"] == ["sh", "/volume/book/.snakemake/job.sh"]
-    assert container["workingDir"] == "/volume/book"
-    assert container["volumeMounts"] == [{"name": pod["volumes"][0]["name"], "mountPath": "/volume"}]
+    assert container["image"] == "python:3.11"
+    assert container["command"] == ["sh", str(folder / "job.sh")]
+    assert container["workingDir"] == str(folder)
+    assert container["volumeMounts"] == [{"name": pod["volumes"][0]["name"], "mountPath": str(folder.parent)}]
+    assert pod["volumes"][0]["persistentVolumeClaim"] == {"claimName": "radar-on-lidar"}
     assert container["resources"]["requests"] == {"cpu": "2", "memory": "8000M"}
     assert container["resources"]["limits"] == {"memory": "8000M"}
     assert job["spec"]["activeDeadlineSeconds"] == 5400
     assert (pod["restartPolicy"], job["spec"]["backoffLimit"]) == ("Never", 0)
 
 
-def test_job_with_a_graphics_card_asks_for_it(submit: ModuleType, given: argparse.Namespace) -> None:
-    given.gpus = 1
-    container = submit.manifest(given, Path("/volume/book"))["spec"]["template"]["spec"]["containers"][0]
+def test_job_with_a_graphics_card_asks_for_it(folder: Path) -> None:
+    job = yaml.safe_load(submit(folder, gpus=1).stdout)
+    container = job["spec"]["template"]["spec"]["containers"][0]
     assert container["resources"]["limits"] == {"memory": "8000M", "nvidia.com/gpu": "1"}
 
 
-def test_job_off_the_volume_is_refused(submit: ModuleType, given: argparse.Namespace) -> None:
-    with pytest.raises(ValueError, match="/elsewhere does not lie on the volume"):
-        submit.manifest(given, Path("/elsewhere"))
+def test_job_off_the_volume_is_refused(folder: Path) -> None:
+    answer = submit(folder, mount=Path("/elsewhere"))
+    assert answer.returncode == 1 and not answer.stdout
+    assert f"{folder} does not lie on the volume, which is mounted at /elsewhere" in answer.stderr
 
 
 @pytest.mark.parametrize(

@@ -59,7 +59,7 @@ def interpolate_trajectory(stamps_us: np.ndarray, poses: np.ndarray) -> Trajecto
     return Trajectory(times, dense, speeds, progress)
 
 
-class DrivenPath:
+class _DrivenPath:
     """Path of a trajectory, parameterized by arc length; straight beyond both ends.
 
     Parameters
@@ -125,7 +125,7 @@ def park_vehicles(
     mesh : Mesh
         The vehicles; empty if there is none.
     """
-    path, meshes = DrivenPath(trajectory), []
+    path, meshes = _DrivenPath(trajectory), []
     s = np.arange(0.5 * SLOT_M, path.arc[-1], SLOT_M)
     things, lane = cKDTree(taken), cKDTree(path.poses[:, :2])
     for offset in (KERB_M, -LANE_M - KERB_M):
@@ -162,7 +162,7 @@ def plan_encounters(
     traffic : Traffic
         Each body is there while it is near.
     """
-    path, bodies = DrivenPath(trajectory), _draw_catalogue(rng)
+    path, bodies = _DrivenPath(trajectory), _draw_catalogue(rng)
     walkers = [build_pedestrian(rng) for _ in range(6)]
     movers: list[tuple[Mesh, int, np.ndarray]] = []
     for stamp in _draw_times(trajectory, vehicles_per_min, 2.5, rng):
@@ -207,7 +207,7 @@ def _grid(trajectory: Trajectory, begin: float, end: float) -> tuple[np.ndarray,
 
 
 def _oncoming(
-    trajectory: Trajectory, path: DrivenPath, meet_us: int, rng: np.random.Generator
+    trajectory: Trajectory, path: _DrivenPath, meet_us: int, rng: np.random.Generator
 ) -> tuple[int, np.ndarray]:
     speed, offset = float(rng.uniform(5.5, 7.5)), -LANE_M + float(rng.normal(0.0, 0.25))
     stamps, progress = _grid(trajectory, meet_us - 20e6, meet_us + 20e6)
@@ -228,7 +228,7 @@ def _draw_spans(trajectory: Trajectory, rng: np.random.Generator) -> list[tuple[
 
 
 def _same_way(
-    trajectory: Trajectory, path: DrivenPath, begin: int, end: int, sign: float, rng: np.random.Generator
+    trajectory: Trajectory, path: _DrivenPath, begin: int, end: int, sign: float, rng: np.random.Generator
 ) -> np.ndarray:
     """A vehicle ahead (+1) or behind (-1), 9 m away at least; it comes and goes at 60 m."""
     stamps, progress = _grid(trajectory, begin, end)
@@ -239,7 +239,7 @@ def _same_way(
 
 
 def _on_foot(
-    trajectory: Trajectory, path: DrivenPath, meet_us: int, rng: np.random.Generator
+    trajectory: Trajectory, path: _DrivenPath, meet_us: int, rng: np.random.Generator
 ) -> tuple[int, np.ndarray]:
     stamps, progress = _grid(trajectory, meet_us - 15e6, meet_us + 15e6)
     at_meeting = float(np.interp(meet_us - stamps[0], stamps - stamps[0], progress))

@@ -27,7 +27,7 @@ PAINT = {
 LIGHT = np.array([-0.35, 0.45, 0.82])  # unit vector to the sun
 
 
-def paint_table() -> np.ndarray:
+def _paint_table() -> np.ndarray:
     """Return the colour of every material, shape (n_materials, 3), grey where none is set."""
     table = np.full((max(Material) + 1, 3), 0.6)
     for material in Material:
@@ -122,7 +122,7 @@ def render(scene: object, rays: np.ndarray, shape: tuple[int, int], haze_m: floa
     to_sun = np.broadcast_to(LIGHT / np.linalg.norm(LIGHT), places.shape)
     in_shadow = np.isfinite(scene.cast(np.hstack([places, to_sun]).astype(np.float32)).t)
     lit = np.clip(hits.normals[is_hit] @ to_sun[0], 0.0, 1.0) * np.where(in_shadow, 0.15, 1.0)
-    table = paint_table()
+    table = _paint_table()
     colours = table[hits.material]
     sky = table[0]
     clear = np.exp(-hits.t[is_hit, None] / haze_m)

@@ -134,7 +134,9 @@ def schedule_firings(
     return stamps, (np.rint(angles).astype(np.int64) % 36_000).astype(np.uint16)
 
 
-def sweep_rays(angles: np.ndarray, T_radar_lidar: np.ndarray, poses: np.ndarray, height: float) -> np.ndarray:
+def _sweep_rays(
+    angles: np.ndarray, T_radar_lidar: np.ndarray, poses: np.ndarray, height: float
+) -> np.ndarray:
     """Return the rays of one turn in the town's frame.
 
     Parameters
@@ -206,7 +208,7 @@ def simulate_sweep(
         The turn in the units of the raw file.
     """
     settings = settings or LidarSettings()
-    hits = scene.cast(sweep_rays(angles, T_radar_lidar, poses, height))
+    hits = scene.cast(_sweep_rays(angles, T_radar_lidar, poses, height))
     reached = np.flatnonzero(hits.t < settings.max_range_m)
     r, cosine, material = hits.t[reached], hits.cos_incidence[reached], hits.material[reached]
     reflectivity, lost_fraction, softness = surface_table()[material].T

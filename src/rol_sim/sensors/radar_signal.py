@@ -164,14 +164,14 @@ def echoes_to_codes(
     floor = streak_scale * _block_energies(field) @ _streak_matrix() + noise_scale * _block_noise()
     leakage = _leakage_field() * (1.0 + 0.2 * rng.standard_normal((2, N_AZIMUTHS, 1), dtype=np.float32))
     field[:, :, :N_LEAKAGE] += leakage
-    add_interference(field, rng, interference_rate)
+    _add_interference(field, rng, interference_rate)
     codes = np.empty((N_AZIMUTHS, N_BINS), dtype=np.uint8)
     _digitize(field, white, np.sqrt(floor).astype(np.float32), _noise_taps(), _code_table(), codes)
     codes[:, : N_COPIES - 1] = codes[:, N_COPIES - 1 : N_COPIES]
     return codes
 
 
-def add_interference(field: np.ndarray, rng: np.random.Generator, rate: float) -> None:
+def _add_interference(field: np.ndarray, rng: np.random.Generator, rate: float) -> None:
     """Add the interference of other radars to some rows: smooth, bright, along the whole row (in place).
 
     Parameters

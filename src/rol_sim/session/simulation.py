@@ -130,7 +130,7 @@ def build_session(settings: SimulationSettings, name: str) -> SimulatedSession:
     """
     describe(settings, name)  # a clear error if there is no such session
     own, rng = settings.sessions[name], partial(_generator, settings, name)
-    given = load_route(settings, own) if settings.world == "route" else None
+    given = _load_route(settings, own) if settings.world == "route" else None
     n_scans = own.scans if given is None else len(given)
     scans, turns = logs.schedule_scans(own.first_stamp_us, n_scans, rng(SCANS))
     if given is None:
@@ -147,7 +147,7 @@ def build_session(settings: SimulationSettings, name: str) -> SimulatedSession:
     )
 
 
-def load_route(settings: SimulationSettings, own: SessionSettings) -> np.ndarray:
+def _load_route(settings: SimulationSettings, own: SessionSettings) -> np.ndarray:
     """Read the real poses that a session of the route is driven along.
 
     Parameters

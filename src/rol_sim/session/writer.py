@@ -93,7 +93,7 @@ def write_session(
     if not _prepare_folder(folder, {"format": FORMAT, **describe(settings, name)}, report):
         return folder
     session = build_session(settings, name)
-    report(f"{name}: {check_disk_space(folder, session)}")
+    report(f"{name}: {_check_disk_space(folder, session)}")
     n = len(session.scans_us)
     edges = np.unique(np.linspace(0, n, min(n, max(20, n // 50)) + 1).astype(int)).tolist()
     begin = perf_counter()
@@ -106,7 +106,7 @@ def write_session(
     return folder
 
 
-def check_disk_space(folder: Path, session: SimulatedSession) -> str:
+def _check_disk_space(folder: Path, session: SimulatedSession) -> str:
     """Compute how much will be written; refuse if the disk has too little free space.
 
     Parameters

@@ -11,7 +11,9 @@ from pathlib import Path
 import pytest
 
 import get_real
-from get_real import FetchError, check_all, fetch_all, load_list
+from get_real import LIST
+from rol_data import fetch
+from rol_data.fetch import FetchError, check_all, fetch_all, load_list
 
 FILES = {f"data/scans/{number}.bin": bytes([number]) * 999 for number in range(5)} | {"poses.txt": b"1 2\r\n"}
 
@@ -72,8 +74,8 @@ def test_files_that_are_not_listed_are_not_transferred(public: tuple[str, dict],
     url, entry = public
     clone, commit = tmp_path / "clone", entry["commit"]
     clone.mkdir()
-    get_real.make_clone(clone, f"{url}/owner/name.git", commit)
-    get_real.fetch_files(clone, commit, list(FILES), entry["files"], tmp_path / "real" / "name")
+    fetch.make_clone(clone, f"{url}/owner/name.git", commit)
+    fetch.fetch_files(clone, commit, list(FILES), entry["files"], tmp_path / "real" / "name")
     assert tree(tmp_path / "real") == FILES
     listed = git(clone, "rev-list", "--objects", "--missing=print", commit)
     blob = hashlib.sha1(b"blob 10\0not listed").hexdigest()
@@ -104,7 +106,7 @@ def test_interrupted_run_is_resumed(
 ) -> None:
     url, entry = public
     root, checkouts = tmp_path / "real", []
-    run_git = get_real.run_git
+    run_git = fetch.run_git
 
     def stop_at_second(clone: Path, *arguments: str) -> None:
         checkouts.extend(arguments[:1] if arguments[0] == "checkout" else ())
@@ -112,13 +114,13 @@ def test_interrupted_run_is_resumed(
             raise KeyboardInterrupt
         run_git(clone, *arguments)
 
-    monkeypatch.setattr(get_real, "BATCH", 2)
-    monkeypatch.setattr(get_real, "run_git", stop_at_second)
+    monkeypatch.setattr(fetch, "BATCH", 2)
+    monkeypatch.setattr(fetch, "run_git", stop_at_second)
     with pytest.raises(KeyboardInterrupt):
         fetch_all([entry], root, url)
-    (root / get_real.FETCHING / "killed" / ".git").mkdir(parents=True)  # as a killed run leaves it
+    (root / fetch.FETCHING / "killed" / ".git").mkdir(parents=True)  # as a killed run leaves it
     assert len(tree(root)) == 2 and len(check_all([entry], root)) == 4
-    monkeypatch.setattr(get_real, "run_git", run_git)
+    monkeypatch.setattr(fetch, "run_git", run_git)
     assert fetch_all([entry], root, url) == []
     assert tree(root) == FILES and os.listdir(root) == ["name"]
 
@@ -153,8 +155,8 @@ def test_a_repository_named_by_the_environment_is_left_alone(
 def test_two_runs_at_once_are_refused(public: tuple[str, dict], tmp_path: Path) -> None:
     url, entry = public
     root = tmp_path / "real"
-    (root / get_real.FETCHING).mkdir(parents=True)
-    with (root / get_real.FETCHING / "lock").open("w") as lock:
+    (root / fetch.FETCHING).mkdir(parents=True)
+    with (root / fetch.FETCHING / "lock").open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
         with pytest.raises(FetchError, match="another run is fetching"):
             fetch_all([entry], root, url)
@@ -165,7 +167,7 @@ def test_command_checks_and_fetches(
 ) -> None:
     url, entry = public
     (tmp_path / "list.json").write_text(json.dumps({"repositories": [entry]}), encoding="utf-8")
-    monkeypatch.setattr(get_real, "load_list", lambda: load_list(tmp_path / "list.json"))
+    monkeypatch.setattr(get_real, "LIST", tmp_path / "list.json")
     monkeypatch.setenv("ROL_REAL_URL", url)
     root = ["--root", str(tmp_path / "real")]
     assert get_real.main([*root, "--check"]) == 1
@@ -175,7 +177,7 @@ def test_command_checks_and_fetches(
 
 
 def test_list_is_whole() -> None:
-    repositories, page = load_list(), (get_real.ROOT / "data" / "README.md").read_text(encoding="utf-8")
+    repositories, page = load_list(LIST), (LIST.parent / "README.md").read_text(encoding="utf-8")
     assert len({repository["folder"] for repository in repositories}) == len(repositories) == 8
     for repository in repositories:
         assert f"| {repository['repository']} |" in page
@@ -186,4 +188,4 @@ def test_list_is_whole() -> None:
 
 
 def test_real_data_at_hand_are_as_listed(real_root: Path) -> None:
-    assert check_all(load_list(), real_root) == []
+    assert check_all(load_list(LIST), real_root) == []
