@@ -22,14 +22,14 @@ SETTINGS = PairSettings(width=64, pixel_size=1.0, range_resolution=0.1, range_of
 def make_pair(seed: int) -> RealPair:
     """A wall at 10 m on the left, seen by both."""
     rng = np.random.default_rng(seed)
-    codes = rng.integers(0, 40, (400, 400)).astype(np.uint8)
+    power = rng.integers(0, 40, (400, 400)).astype(np.uint8)
     x = np.arange(-12.0, 12.0, 0.5)
     wall = np.column_stack([x, np.full(len(x), 10.0)])
     rows = (
         np.rint(np.mod(-np.arctan2(wall[:, 1], wall[:, 0]), 2 * np.pi) / (2 * np.pi) * 400).astype(int) % 400
     )
-    codes[rows, np.rint(np.hypot(*wall.T) / 0.1).astype(int)] = 200
-    return RealPair(codes, AZIMUTHS, wall)
+    power[rows, np.rint(np.hypot(*wall.T) / 0.1).astype(int)] = 200
+    return RealPair(power, AZIMUTHS, wall)
 
 
 @pytest.fixture

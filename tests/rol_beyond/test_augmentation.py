@@ -19,11 +19,11 @@ SETTINGS = PairSettings("corrected", max_range=60.0, width=256, pixel_size=0.5)
 
 
 def bright_spot(bearing: float, range_m: float) -> np.ndarray:
-    codes = np.full((400, 3768), 6, dtype=np.uint8)
+    power = np.full((400, 3768), 6, dtype=np.uint8)
     row = int(np.argmin(np.abs(np.angle(np.exp(1j * (AZIMUTHS - bearing))))))
     bin_ = round((range_m + 0.31) / 0.0438 - 0.5)
-    codes[row - 1 : row + 2, bin_ - 8 : bin_ + 9] = 200
-    return codes
+    power[row - 1 : row + 2, bin_ - 8 : bin_ + 9] = 200
+    return power
 
 
 def middle_of(image: np.ndarray) -> np.ndarray:
@@ -39,48 +39,48 @@ def middle_of(image: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("turn", [0.0, 0.4, 2.0, -1.1, -3.1, 3.14])
 @pytest.mark.parametrize("twist", [(0.0, 0.0, 0.0), (12.0, 0.3, 0.2)])
 def test_a_turned_scan_is_the_scan_of_a_turned_world(turn: float, twist: tuple) -> None:
-    codes = bright_spot(-1.2, 35.0)
-    plain = middle_of(rotated_radar_image(codes, AZIMUTHS, 0.0, twist, SETTINGS))
-    turned = middle_of(rotated_radar_image(codes, AZIMUTHS, turn, twist, SETTINGS))
+    power = bright_spot(-1.2, 35.0)
+    plain = middle_of(rotated_radar_image(power, AZIMUTHS, 0.0, twist, SETTINGS))
+    turned = middle_of(rotated_radar_image(power, AZIMUTHS, turn, twist, SETTINGS))
     c, s = np.cos(turn), np.sin(turn)
     np.testing.assert_allclose(turned, np.array([[c, -s], [s, c]]) @ plain, atol=0.12)
 
 
 def test_without_motion_turning_by_rows_moves_rows() -> None:
-    codes = np.random.default_rng(0).integers(0, 120, (400, 3768)).astype(np.uint8)
+    power = np.random.default_rng(0).integers(0, 120, (400, 3768)).astype(np.uint8)
     plain = replace(SETTINGS, motion="none")
-    turned = rotated_radar_image(codes, AZIMUTHS, -2.0 * np.pi * 100 / 400, (0, 0, 0), plain)
-    rolled = rotated_radar_image(np.roll(codes, 100, axis=0), AZIMUTHS, 0.0, (0, 0, 0), plain)
+    turned = rotated_radar_image(power, AZIMUTHS, -2.0 * np.pi * 100 / 400, (0, 0, 0), plain)
+    rolled = rotated_radar_image(np.roll(power, 100, axis=0), AZIMUTHS, 0.0, (0, 0, 0), plain)
     assert np.abs(turned.astype(int) - rolled).max() <= 1
 
 
-def test_gain_moves_codes_and_leaves_silence() -> None:
-    codes = np.array([[0, 6, 120, 254]], dtype=np.uint8)
-    np.testing.assert_array_equal(augmentation.apply_gain(codes, 2.0), [[0, 10, 124, 255]])
-    np.testing.assert_array_equal(augmentation.apply_gain(codes, -4.0), [[0, 1, 112, 246]])
-    assert augmentation.apply_gain(codes, 0.0) is codes
+def test_gain_changes_power_above_zero_only() -> None:
+    power = np.array([[0, 6, 120, 254]], dtype=np.uint8)
+    np.testing.assert_array_equal(augmentation.apply_gain(power, 2.0), [[0, 10, 124, 255]])
+    np.testing.assert_array_equal(augmentation.apply_gain(power, -4.0), [[0, 1, 112, 246]])
+    assert augmentation.apply_gain(power, 0.0) is power
 
 
 def test_streaks_brighten_a_few_rows_and_darken_nothing() -> None:
-    codes = bright_spot(-1.2, 35.0)
-    dazzled = augmentation.add_streaks(codes, 2, np.random.default_rng(1))
-    assert (dazzled >= codes).all() and codes[0, 0] == 6
-    changed = np.flatnonzero((dazzled != codes).mean(axis=1) > 0.2)
+    power = bright_spot(-1.2, 35.0)
+    with_streaks = augmentation.add_streaks(power, 2, np.random.default_rng(1))
+    assert (with_streaks >= power).all() and power[0, 0] == 6
+    changed = np.flatnonzero((with_streaks != power).mean(axis=1) > 0.2)
     assert 2 <= len(changed) <= 14  # of 400
-    near, far = (np.median(dazzled[changed][:, part]) for part in (slice(700, 900), slice(3000, 3700)))
+    near, far = (np.median(with_streaks[changed][:, part]) for part in (slice(700, 900), slice(3000, 3700)))
     assert near > far + 10
-    np.testing.assert_array_equal(dazzled, augmentation.add_streaks(codes, 2, np.random.default_rng(1)))
-    np.testing.assert_array_equal(augmentation.add_streaks(codes, 0, np.random.default_rng(1)), codes)
+    np.testing.assert_array_equal(with_streaks, augmentation.add_streaks(power, 2, np.random.default_rng(1)))
+    np.testing.assert_array_equal(augmentation.add_streaks(power, 0, np.random.default_rng(1)), power)
 
 
 def test_ghosts_are_echoes_elsewhere() -> None:
-    codes = bright_spot(-1.2, 35.0)
-    haunted = augmentation.add_ghosts(codes, 5, np.random.default_rng(1))
-    assert (haunted >= codes).all() and (codes > 6).sum() == 51
-    changed = np.argwhere(haunted != codes)
+    power = bright_spot(-1.2, 35.0)
+    with_ghosts = augmentation.add_ghosts(power, 5, np.random.default_rng(1))
+    assert (with_ghosts >= power).all() and (power > 6).sum() == 51
+    changed = np.argwhere(with_ghosts != power)
     assert 5 < len(changed) <= 5 * 51 and changed[:, 1].max() < 1600
-    assert haunted[tuple(changed.T)].max() <= 200 and haunted[tuple(changed.T)].max() > 100
-    np.testing.assert_array_equal(haunted, augmentation.add_ghosts(codes, 5, np.random.default_rng(1)))
+    assert with_ghosts[tuple(changed.T)].max() <= 200 and with_ghosts[tuple(changed.T)].max() > 100
+    np.testing.assert_array_equal(with_ghosts, augmentation.add_ghosts(power, 5, np.random.default_rng(1)))
     quiet = np.full((400, 3768), 6, dtype=np.uint8)  # nothing bright, no ghosts
     np.testing.assert_array_equal(augmentation.add_ghosts(quiet, 5, np.random.default_rng(1)), quiet)
 
@@ -111,9 +111,9 @@ def test_both_sides_of_a_pair_turn_together(tmp_path: Path) -> None:
     assert gaps.max() <= 0.5 * 0.5 * np.sqrt(2.0) + 1e-9
     for plain, again in zip(pairs[0], pairs.draw(0, 0.0), strict=True):
         np.testing.assert_array_equal(plain, again)
-    dazzled = pairs.draw(0, 0.0, 0.0, 3, 2, np.random.default_rng(2))
-    assert (dazzled[0] > pairs[0][0]).sum() > 100  # the radar alone
-    np.testing.assert_array_equal(dazzled[1], pairs[0][1])
+    with_streaks = pairs.draw(0, 0.0, 0.0, 3, 2, np.random.default_rng(2))
+    assert (with_streaks[0] > pairs[0][0]).sum() > 100  # the radar alone
+    np.testing.assert_array_equal(with_streaks[1], pairs[0][1])
     with pytest.raises(ValueError, match="need a random generator"):
         pairs.draw(0, 0.0, 0.0, 1)
 
