@@ -10,6 +10,7 @@
 
 import json
 import os
+import shlex
 import sys
 from pathlib import Path
 
@@ -173,6 +174,23 @@ STEPS = {
     ),
     "performance": ("12_performance", "performance", {"measured": found("data/performance/*.json")}, {}),
 }
+def clear_images(folder, listing, code):
+    """Write the command that removes the images of other code from a folder: a job goes on with those of a stopped run."""
+    return (
+        f'made={folder}; [ "$(cat "$made.code" 2>/dev/null)" = {code} ] '
+        f"""|| ! grep -qs '"listing": "{listing}"' "$made/settings.json" """
+        """|| find "$made" -maxdepth 2 -name '[0-9]*.png' -delete; """
+        f'mkdir -p "$(dirname "$made")"; echo {code} > "$made.code"; '
+    )
+
+
+PAIRS_CODE = chapters.module_digest("rol.pairs")
+BEFORE = {  # commands that come before papermill
+    "ground_removal": lambda wildcards: "".join(
+        clear_images(shlex.quote(f"{OUT}/{folder}/{wildcards.session}"), "pairs.json", PAIRS_CODE)
+        for folder in ("pairs", "pairs-corrected")
+    )
+}
 # All others have 0. Those with -1 need no other chapter and fill gaps.
 PRIORITIES = {"real_vs_fake": 1, "oxford_route": -1, "ablations": -1, "performance": -1}
 
@@ -212,7 +230,7 @@ rule simulated_session:
         SESSIONS_ROOT + "/{session}.log",
     params:
         recipe=lambda wildcards: json.dumps(recipe(wildcards.session), sort_keys=True),
-        code=chapters.simulator_digest(),
+        code=chapters.module_digest(f"{chapters.SIMULATOR}.__main__"),
         made=SESSIONS_ROOT + "/{session}",
     message:
         "simulated session {wildcards.session}"
@@ -240,11 +258,12 @@ for name, (chapter, message, reads, writes) in STEPS.items():
         params:
             arguments=arguments(chapter),
             code=DIGESTS[chapter],
+            before=BEFORE.get(name, ""),
         priority: PRIORITIES.get(name, 0)
         message:
             f"{chapter[:2]} {message}"
         shell:
-            PAPERMILL
+            "{params.before}" + PAPERMILL
 
 
 rule pix2pix:
@@ -286,10 +305,7 @@ rule generated_images:
     priority: 1
     message:
         "generated images, {wildcards.session}"
-    shell:  # continues with the images of a stopped run; those of other code are removed
-        'made={params.out:q}; [ "$(cat "$made.code" 2>/dev/null)" = {params.code} ] '
-        """|| ! grep -qs '"listing": "fake.json"' "$made/settings.json" """
-        """|| find "$made" -maxdepth 1 -name '[0-9]*.png' -delete; """
-        'echo {params.code} > "$made.code"; '
+    shell:
+        clear_images("{params.out:q}", "fake.json", "{params.code}")
         + ENVIRONMENT + "OMP_NUM_THREADS={threads} {PYTHON:q} workflow/generate_images.py {params.pairs:q} {input.weights:q} "
         "{params.out:q} --threads {threads} {params.options} > {log:q} 2>&1 || {{ tail -n 30 {log:q}; exit 1; }}"

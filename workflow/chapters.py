@@ -364,9 +364,9 @@ def chapter_digest(path: str | Path) -> str:
     return digest([*cells, *code_of(module_files(cells, str(path)))])
 
 
-def simulator_digest() -> str:
-    """Compute the digest of all code that writes simulated sessions, and of the lock file."""
-    return digest(code_of(module_files([f"import {SIMULATOR}.__main__"], "workflow/chapters.py")))
+def module_digest(name: str) -> str:
+    """Compute the digest of a module of the packages, the modules it uses and the lock file."""
+    return digest(code_of(module_files([f"import {name}"], "workflow/chapters.py")))
 
 
 def script_digest(name: str) -> str:

@@ -279,7 +279,7 @@ def test_digest_follows_code_and_versions(
 def test_every_digest_follows_the_lock_file(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     def digests() -> list[str]:
         return [
-            chapters.simulator_digest(),
+            chapters.module_digest("rol.pairs"),
             chapters.script_digest("generate_images.py"),
             chapters.stored_digest(new_notebook(), {}),
         ]

@@ -102,23 +102,42 @@ def test_training_continues_after_a_stop_and_starts_anew_after_a_change(workplac
 
 
 @pytest.mark.slow
-def test_images_of_other_code_are_generated_anew(workplace: Path) -> None:
-    folder = workplace / "my results/fake" / chapters.load_config(ROOT / "config/smoke.yaml")["sessions"][0]
-    folder.mkdir(parents=True)
-    (folder / "settings.json").write_text('{"listing": "fake.json", "settings": {}}', encoding="utf-8")
-    command = [word if word != "pix2pix" else "generated_images" for word in train(workplace)[:-1]] + [
-        folder / "fake.json"
+@pytest.mark.parametrize(
+    ("rule", "folder", "listing", "image"),
+    [
+        ("generated_images", "fake", "fake.json", "7.png"),
+        ("ground_removal", "pairs", "pairs.json", "radar/7.png"),
+    ],
+)
+def test_images_of_other_code_are_made_anew(
+    workplace: Path, rule: str, folder: str, listing: str, image: str
+) -> None:
+    config = chapters.load_config(ROOT / "config/smoke.yaml")
+    session = config["sessions"][0]
+    made = workplace / "my results" / folder / session
+    needed = [
+        workplace / config["sessions_root"] / session / "session.json",
+        workplace / "my results/alignment" / session / "alignment.csv",
+        made / image,
     ]
+    for path in needed:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.touch()
+    (made / "settings.json").write_text(f'{{"listing": "{listing}", "settings": {{}}}}', encoding="utf-8")
+    if rule == "ground_removal":
+        (made / listing).unlink()
+    command = [word if word != "pix2pix" else rule for word in train(workplace)[:-1]] + [made / listing]
     there = []
-    for code in ("other", None):  # the job ends without images, since the pairs are none
-        (folder / "7.png").touch()
+    for code in ("other", None):
+        needed[-1].touch()
         if code:
-            folder.with_name(f"{folder.name}.code").write_text(code, encoding="utf-8")
+            made.with_name(f"{made.name}.code").write_text(code, encoding="utf-8")
         answer = subprocess.run(
             command, check=False, cwd=workplace, env=environment(workplace), capture_output=True, text=True
         )
-        assert "not a list of pairs" in answer.stdout + answer.stderr
-        there.append((folder / "7.png").exists())
+        # The job ends without images: the pairs are none, and papermill is a stand-in.
+        assert rule in answer.stdout + answer.stderr and answer.returncode != 0
+        there.append(needed[-1].exists())
     assert there == [False, True]
 
 
