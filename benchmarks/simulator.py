@@ -30,7 +30,7 @@ from rol_sim.session.simulation import SimulatedSession, build_session, make_sca
 ROOT = Path(__file__).resolve().parents[1]
 
 
-def open_drive() -> tuple[SimulatedSession, float]:
+def build_benchmark_session() -> tuple[SimulatedSession, float]:
     """Build a session of the route, or of the town without the real data; gives also the seconds it took."""
     config = "route" if rall.find_real_root() else "demo"
     settings = load_settings(ROOT / "config" / f"{config}.yaml")
@@ -81,7 +81,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description="How fast simulated sensors are, and where the time goes.")
     parser.add_argument("--scans", type=positive, default=40)
     given = parser.parse_args()
-    session, built_s = open_drive()
+    session, built_s = build_benchmark_session()
     indices = np.linspace(5, len(session.scans_us) - 5, given.scans).astype(int)
     with tempfile.TemporaryDirectory() as folder:
         time_scan(session, int(indices[0]), Path(folder))  # compiles

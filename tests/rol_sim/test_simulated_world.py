@@ -363,7 +363,9 @@ def test_sweep_reads_back_as_the_true_hits(sensor: str) -> None:
     stamps, angles = schedule_firings(STAMP, np.random.default_rng(1), first_angle=1.0)
     t = (stamps - STAMP) * 1e-6
     poses = np.column_stack([2.0 + 9.0 * t, -1.0 + 3.0 * t, 0.4 + 1.5 * t])
-    sweep = simulate_sweep(room(), stamps, angles, T_radar_lidar, poses, 2.0, np.random.default_rng(2), CLEAN)
+    sweep = simulate_sweep(
+        room(), (stamps, angles), T_radar_lidar, poses, 2.0, np.random.default_rng(2), CLEAN
+    )
     raw = VelodyneRaw(sweep.intensities, sweep.ranges, sweep.angles, sweep.stamps_us)
     points, point_stamps = velodyne_raw_to_points(raw)
     assert len(points) > 0.8 * 32 * len(stamps)
@@ -384,7 +386,7 @@ def test_both_lidars_see_the_same_town(town: world.Town) -> None:
         T = np.linalg.inv(EXTRINSICS["radar"]) @ EXTRINSICS[sensor]
         stamps, angles = schedule_firings(STAMP, np.random.default_rng(1))
         poses = np.repeat(pose, len(stamps), axis=0)
-        sweep = simulate_sweep(scene, stamps, angles, T, poses, 2.0, np.random.default_rng(2))
+        sweep = simulate_sweep(scene, (stamps, angles), T, poses, 2.0, np.random.default_rng(2))
         raw = VelodyneRaw(sweep.intensities, sweep.ranges, sweep.angles, sweep.stamps_us)
         points, _ = velodyne_raw_to_points(raw)
         materials = sweep.materials.T[raw.ranges.T * 0.002 > 1.0]
@@ -421,7 +423,9 @@ def test_what_a_lidar_loses() -> None:
 
     def level_ranges(material: int, distance: float, settings: LidarSettings) -> np.ndarray:
         far = Scene(build_box(-distance, distance, -distance, distance, -300.0, 300.0, material))
-        sweep = simulate_sweep(far, stamps, angles, np.eye(4), poses, 2.0, np.random.default_rng(3), settings)
+        sweep = simulate_sweep(
+            far, (stamps, angles), np.eye(4), poses, 2.0, np.random.default_rng(3), settings
+        )
         return sweep.ranges[8, :40] * 0.002  # the level laser, within 13 deg of the wall's normal
 
     assert (level_ranges(Material.FACADE, 101.0, CLEAN) == 0).all()

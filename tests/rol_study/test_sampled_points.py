@@ -84,11 +84,11 @@ def test_false_points_last_as_long_as_stated() -> None:
     assert len(find_visible_points(far, poses[:1])[0]) == 0
 
 
-def test_a_map_without_points_or_out_of_sight_is_refused() -> None:
+def test_an_empty_or_invisible_map_is_refused() -> None:
     with pytest.raises(SampledPointsError, match="holds no point"):
         find_visible_points(np.zeros((0, 2)), np.zeros((1, 3)))
     poses = np.zeros((2, 3))
-    with pytest.raises(SampledPointsError, match="nothing of the map can be seen"):
+    with pytest.raises(SampledPointsError, match="nothing of the map is visible"):
         next(
             sample_points(
                 WALL + (900.0, 0.0),

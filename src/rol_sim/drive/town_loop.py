@@ -168,7 +168,7 @@ def plan_trajectory(
     n_stops: int = 2,
     stand_s: float = 1.5,
 ) -> Trajectory:
-    """Drive along the route.
+    """Plan a trajectory along the route.
 
     Parameters
     ----------
@@ -192,7 +192,7 @@ def plan_trajectory(
     Returns
     -------
     trajectory : Trajectory
-        Truth at 200 Hz.
+        True poses at 200 Hz.
 
     Raises
     ------

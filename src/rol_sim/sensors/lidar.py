@@ -175,8 +175,7 @@ def _sweep_rays(
 
 def simulate_sweep(
     scene: Scene,
-    stamps_us: np.ndarray,
-    angles: np.ndarray,
+    firings: tuple[np.ndarray, np.ndarray],
     T_radar_lidar: np.ndarray,
     poses: np.ndarray,
     height: float,
@@ -188,9 +187,9 @@ def simulate_sweep(
     Parameters
     ----------
     scene : Scene
-        The town at the middle of the turn.
-    stamps_us, angles : array, shape (n,)
-        Firings as from `schedule_firings`.
+        The world at the middle of the turn.
+    firings : tuple of two arrays, shape (n,)
+        Times [us] and angles [0.01 deg], from `schedule_firings`.
     T_radar_lidar : array, shape (4, 4)
         Place of the lidar in the radar frame.
     poses : array, shape (n, 3)
@@ -207,7 +206,7 @@ def simulate_sweep(
     sweep : Sweep
         The turn in the units of the raw file.
     """
-    settings = settings or LidarSettings()
+    (stamps_us, angles), settings = firings, settings or LidarSettings()
     hits = scene.cast(_sweep_rays(angles, T_radar_lidar, poses, height))
     reached = np.flatnonzero(hits.t < settings.max_range_m)
     r, cosine, material = hits.t[reached], hits.cos_incidence[reached], hits.material[reached]

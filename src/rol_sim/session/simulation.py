@@ -391,4 +391,4 @@ def make_sweep(session: SimulatedSession, sensor: str, index: int) -> Sweep:
     T_radar_lidar = np.linalg.inv(EXTRINSICS["radar"]) @ EXTRINSICS[sensor]
     settings, _ = sensor_settings(session.settings)
     scene = session.scene_at(float(stamps[len(stamps) // 2]), settings.max_range_m + 10.0)
-    return simulate_sweep(scene, stamps, angles, T_radar_lidar, poses, float(height), rng, settings)
+    return simulate_sweep(scene, (stamps, angles), T_radar_lidar, poses, float(height), rng, settings)
