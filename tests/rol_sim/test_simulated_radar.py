@@ -204,7 +204,7 @@ def test_statistics_of_real_scans_are_those_measured(real_root):
         np.unique(real)
     )
     for code, share in {40: 0.055, 60: 0.021, 80: 0.0077, 100: 0.0019, 120: 0.0002}.items():
-        assert found["shares"][code] == pytest.approx(share, rel=0.1)
+        assert found["fractions"][code] == pytest.approx(share, rel=0.1)
     measured = {3.0: 0.45, 28.0: 0.36, 41.0: 0.35, 80.0: 0.40, 106.0: 0.46, 145.0: 0.50}
     for range_m, share in measured.items():
         assert found["zero_fractions"][range_m] == pytest.approx(share, abs=0.04)
