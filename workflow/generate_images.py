@@ -19,24 +19,19 @@ from rol_book.parameters import positive
 BF16 = {"auto": "auto", "true": True, "false": False}
 
 
-def read_arguments(words: list[str] | None = None) -> argparse.Namespace:
-    """Read the command line."""
+def main(words: list[str] | None = None) -> int:
+    """Generate the images; return 0, or 1 after a fault, which is printed on stderr."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("pairs", help="folder of the pairs of the session")
     parser.add_argument("weights", help="file of the network")
     parser.add_argument("out", help="folder of the generated images of the session")
     parser.add_argument(
-        "--threshold", type=int, default=0, help="grey value of a point; 0: the network's own"
+        "--threshold", type=int, default=0, help="grey value of a point; 0: that of the network"
     )
     parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu", help="cpu or cuda")
     parser.add_argument("--bf16", choices=BF16, default="auto", help="use bfloat16; auto: where possible")
     parser.add_argument("--threads", type=positive, default=1, help="threads of the processor")
-    return parser.parse_args(words)
-
-
-def main(words: list[str] | None = None) -> int:
-    """Generate the images; return 0, or 1 after a fault, which is printed on stderr."""
-    given = read_arguments(words)
+    given = parser.parse_args(words)
     torch.set_num_threads(given.threads)
     options = {"threshold": given.threshold, "device": given.device, "bf16": BF16[given.bf16]}
     try:

@@ -1,6 +1,6 @@
 """Measure the filters on the real route over many seeds, settings and wrong starts: tables of hours of filtering.
 
-python workflow/measure_route.py [--real-root DIR] [--jobs 2] [--only seeds,settings,...]
+python benchmarks/route.py [--real-root DIR] [--jobs 2] [--only seeds,settings,...]
 
 Writes data/ablations/route_<what>.csv row by row; a run that was stopped continues where it ended. The chapter on the
 Oxford route reads these tables, and makes one run of each session itself.
