@@ -25,9 +25,7 @@ def main(words: list[str] | None = None) -> int:
     parser.add_argument("pairs", help="folder of the pairs of the session")
     parser.add_argument("weights", help="file of the network")
     parser.add_argument("out", help="folder of the generated images of the session")
-    parser.add_argument(
-        "--threshold", type=int, default=0, help="grey value of a point; 0: that of the network"
-    )
+    parser.add_argument("--threshold", type=int, default=0, help="grey value; 0: that of the network")
     parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu", help="cpu or cuda")
     parser.add_argument("--bf16", choices=BF16, default="auto", help="use bfloat16; auto: where possible")
     parser.add_argument("--threads", type=positive, default=1, help="threads of the processor")

@@ -81,10 +81,9 @@ def experiment_of(
 def row_of(experiment: RouteExperiment, run: FilterRun, method: str, seed: int) -> dict:
     """Compute the metrics of one run."""
     truth, errors = experiment.session.truth, pose_errors(run.poses, experiment.session.truth)
-    row = summarize(
-        run.poses, truth, method=method, session=experiment.session.number, failures=len(run.failures),
-        update_ms_median=float(np.median(run.update_ms)), seed=seed,
-    )  # fmt: skip
+    about = {"method": method, "session": experiment.session.number, "seed": seed}
+    update_ms = float(np.median(run.update_ms))
+    row = summarize(run.poses, truth, failures=len(run.failures), update_ms_median=update_ms, **about)
     return row | {
         "median_m": float(np.median(errors.position_m)),
         "median_yaw_deg": float(np.rad2deg(np.median(np.abs(errors.yaw_rad)))),
