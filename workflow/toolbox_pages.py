@@ -81,7 +81,9 @@ def stage_toolbox(book: Path) -> list[dict]:
         name = module_name(package)
         lines = [f".. automodule:: {name}", "", *table_of(docstrings_of(files))]
         write_text(book / f"{page_name(package)}.md", page_text(name, f"Folder: `src/{name}`.", lines))
-        sections = [{"file": page_name(file)} for file in files]
+        sections = [
+            {"file": page_name(file), "title": module_name(file).removeprefix(f"{name}.")} for file in files
+        ]
         entries.append({"file": page_name(package), "sections": sections})
     above = (
         "One page for each module, with signature, docstring and code of every public function and class."
