@@ -32,7 +32,7 @@ def page_text(title: str, above: str, lines: list[str]) -> str:
 
 def table_of(docstrings: dict[str, str | None]) -> list[str]:
     """Write a table of full names, each linked and with the first sentence of its docstring."""
-    lines = [".. list-table::", "   :header-rows: 1", "", "   * - name", "     - what it is or does"]
+    lines = [".. list-table::", "   :header-rows: 1", "", "   * - name", "     - description"]
     for name, docstring in docstrings.items():
         paragraph = " ".join((docstring or "").split("\n\n")[0].split())
         sentence = re.split(r"(?<=[.?!]) (?=[A-Z])", paragraph)[0]
