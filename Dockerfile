@@ -4,7 +4,8 @@ COPY apt.txt .
 RUN apt-get update && apt-get install -y --no-install-recommends $(cat apt.txt) && rm -rf /var/lib/apt/lists/*
 
 FROM system
-COPY . /srv/radar-on-lidar
-WORKDIR /srv/radar-on-lidar
+WORKDIR /srv
+COPY . radar-on-lidar
+WORKDIR radar-on-lidar
 RUN make setup
 CMD ["make", "book"]

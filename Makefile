@@ -2,8 +2,8 @@
 # make test        set up, then lint, unit tests, all chapters on the smoke profile, and checks of what came out
 # make check       compare the numbers of a build with the reference (PROFILE=demo; RUN=.../metrics.json: one rerun)
 # make notebooks   make book, then renew the executed notebooks stored in notebooks/
-# make weights     train a network of data/weights/recipe.yaml (NETWORK=rol) and put its weights into data/weights
-# make judge       judge the weights of a network (NETWORK=rol) again and compare with their card
+# make weights     train a network of data/weights/recipe.yaml (NETWORK=unet) and put its weights into data/weights
+# make judge       judge the weights of a network (NETWORK=unet) again and compare with their card
 # make real        fetch the small pieces of real data from public repositories into data/real (CHECK=1: only check them)
 # make archive     one zip of code, executed notebooks, book and results with an RO-Crate, after make book
 # make clean       remove everything made by the above but .venv, data/real and the sessions that networks learn from
@@ -22,7 +22,7 @@ BIN := .venv/bin
 STAMP := .venv/set-up-$(shell cat requirements.lock pyproject.toml | cksum | cut -d ' ' -f 1)
 CORES ?= $(shell nproc 2>/dev/null || sysctl -n hw.ncpu)
 PROFILE ?= demo
-NETWORK ?= rol
+NETWORK ?= unet
 SNAKEMAKE = $(BIN)/snakemake --configfile config/$(PROFILE).yaml --cores $(CORES)
 PYTEST = MPLBACKEND=Agg OMP_NUM_THREADS=1 OMP_WAIT_POLICY=PASSIVE $(BIN)/python -m pytest
 

@@ -5,11 +5,12 @@
 #   snakemake -c2 -n                                  only say what would run, and why
 #
 # A run is out of date when the code it uses, its parameters or its inputs changed. Code means the notebook's code cells
-# and the modules of src/rol that it imports, without comments and docstrings: they enter as a digest in `params`, so
-# editing a text reruns no notebook (the book takes the new text all the same).
+# and the modules under src that it imports, without comments and docstrings, and the versions in requirements.lock: they
+# enter as a digest in `params`, so editing a text reruns no notebook (the book takes the new text all the same).
 
 import json
 import os
+import shlex
 import sys
 from pathlib import Path
 
@@ -33,8 +34,7 @@ RUNS = chapters.all_runs(config)
 PARAMETERS = {run: chapters.run_parameters(config, run) for run in RUNS}  # a name that a notebook lacks ends here
 DIGESTS = {chapter: chapters.chapter_digest(NOTEBOOKS / f"{chapter}.ipynb") for chapter in chapters.CHAPTERS}
 TRANSLATION = chapters.translation(config)  # network and options of the generated images, those of chapter 05
-RECIPES = (config["virtual"] or {}).get("sessions", {})
-SHIPPED = [str(path) for path in sorted(Path("data/weights").glob("[!.]*.safetensors"))]  # networks that come with the book
+RECIPES = (config["simulated"] or {}).get("sessions", {})
 PYTHON, JUPYTER_BOOK = sys.executable, Path(sys.executable).with_name("jupyter-book")
 
 # One job uses the threads it was given and no more, and threads that wait leave the processor to others.
@@ -54,7 +54,7 @@ wildcard_constraints:
 
 
 def session_made(session):
-    """Name the file that says a session is there; a virtual one is made by its rule, a real one must be on disk."""
+    """Name the file that says a session is there; a simulated one is made by its rule, a real one must be on disk."""
     if session in RECIPES:
         return f"{SESSIONS_ROOT}/{session}/session.json"
     stamps = f"{SESSIONS_ROOT}/{session}/radar.timestamps"
@@ -64,8 +64,8 @@ def session_made(session):
 
 
 def recipe(session):
-    """Give what a virtual session depends on: the settings common to all and its own."""
-    return {**config["virtual"], "sessions": {session: RECIPES[session]}}
+    """Give what a simulated session depends on: the settings common to all and its own."""
+    return {**config["simulated"], "sessions": {session: RECIPES[session]}}
 
 
 def executed(chapter, folder=f"{OUT}/notebooks"):
@@ -93,14 +93,116 @@ def source(chapter):
     return ancient(f"notebooks/{chapter}.ipynb")
 
 
+def of_session(wildcards):
+    """Name the file that says that the session of a job is there."""
+    return session_made(wildcards.session)
+
+
+def found(pattern):
+    """List the files of the project that a pattern matches, without hidden ones."""
+    return sorted(str(path) for path in Path().glob(pattern) if not path.name.startswith("."))
+
+
+SHIPPED = found("data/weights/*.safetensors")  # networks that come with the book
+
+
+# ---- what the chapters read and write ---------------------------------------------------------------------------
+
+ALIGNMENT = OUT + "/alignment/{session}/alignment.csv"
+PAIRS, CORRECTED = (OUT + "/" + folder + "/{session}/pairs.json" for folder in ("pairs", "pairs-corrected"))
+GENERATED = OUT + "/fake/{session}/fake.json"
+NETWORK, SUMMARY, MAPS = f"{OUT}/pix2pix/generator.safetensors", f"{OUT}/maps/summary.json", OUT + "/maps/{session}.npz"
+TRUTH, METRICS = OUT + "/ground_truth/{session}.tum", OUT + "/localization/{session}/{method}/metrics.json"
+ALL_MADE = [session_made(session) for session in SESSIONS]
+
+# Rule: its chapter, its message, and the files that it reads and writes besides its notebook. 04 has a rule of its own.
+STEPS = {
+    "sessions": ("01_sessions", "sessions", {"sessions": ALL_MADE}, {}),
+    "alignment": ("02_alignment", "alignment, {wildcards.session}", {"session": of_session}, {"alignment": ALIGNMENT}),
+    "ground_removal": (
+        "03_ground_removal",
+        "ground removal, {wildcards.session}",
+        {"session": of_session, "alignment": ALIGNMENT},
+        {"pairs": PAIRS, "corrected": CORRECTED},
+    ),
+    "real_vs_fake": (
+        "05_real_vs_fake",
+        "real against fake",
+        {
+            "pairs": expand(PAIRS, session=SESSIONS),
+            "corrected": expand(CORRECTED, session=LOCALIZE),
+            "fake": expand(GENERATED, session=SESSIONS),
+            "weights": NETWORK,
+            "shipped": SHIPPED,
+        },
+        {"similarity": expand(OUT + "/similarity/{session}.json", session=SESSIONS)},
+    ),
+    "ground_truth": (
+        "06_ground_truth",
+        "ground truth",
+        {"sessions": ALL_MADE, "alignment": expand(ALIGNMENT, session=SESSIONS)},
+        {"summary": SUMMARY, "maps": expand(MAPS, session=SESSIONS), "truth": expand(TRUTH, session=SESSIONS)},
+    ),
+    "localization": (
+        "07_localization",
+        "localization, {wildcards.session}, {wildcards.method}",
+        {"fake": GENERATED, "corrected": CORRECTED, "summary": SUMMARY, "map": MAPS.format(session=TRAIN), "truth": TRUTH},
+        {"metrics": METRICS},
+    ),
+    "results": (
+        "08_results",
+        "results",
+        {
+            "metrics": expand(METRICS, session=LOCALIZE, method=METHODS),
+            "summary": SUMMARY,
+            "tables": found("data/paper/*.csv"),
+        },
+        {},
+    ),
+    "oxford_route": (
+        "09_oxford_route",
+        "the real route",
+        {"tables": found("data/paper/*.csv"), "measured": found("data/ablations/route_*.csv")},
+        {},
+    ),
+    "real_radar": ("10_real_radar", "real radar", {"weights": NETWORK, "shipped": SHIPPED}, {}),
+    "ablations": (
+        "11_ablations",
+        "ablations",
+        {"tables": found("data/ablations/*.csv"), "cards": [str(Path(path).with_suffix(".json")) for path in SHIPPED]},
+        {},
+    ),
+    "performance": ("12_performance", "performance", {"measured": found("data/performance/*.json")}, {}),
+}
+def clear_images(folder, listing, code):
+    """Write the command that removes the images of other code from a folder: a job goes on with those of a stopped run."""
+    return (
+        f'made={folder}; [ "$(cat "$made.code" 2>/dev/null)" = {code} ] '
+        f"""|| ! grep -qs '"listing": "{listing}"' "$made/settings.json" """
+        """|| find "$made" -maxdepth 2 -name '[0-9]*.png' -delete; """
+        f'mkdir -p "$(dirname "$made")"; echo {code} > "$made.code"; '
+    )
+
+
+PAIRS_CODE = chapters.module_digest("rol.pairs")
+BEFORE = {  # commands that come before papermill
+    "ground_removal": lambda wildcards: "".join(
+        clear_images(shlex.quote(f"{OUT}/{folder}/{wildcards.session}"), "pairs.json", PAIRS_CODE)
+        for folder in ("pairs", "pairs-corrected")
+    )
+}
+# All others have 0. Those with -1 need no other chapter and fill gaps.
+PRIORITIES = {"real_vs_fake": 1, "oxford_route": -1, "ablations": -1, "performance": -1}
+
+
 rule book:
     input:
         notebooks=[run.path(OUT) for run in RUNS],
         sources=[f"notebooks/{chapter}.ipynb" for chapter in chapters.CHAPTERS],
-        pages=[str(path) for path in sorted(Path("book").rglob("[!.]*")) if path.is_file()],
-        modules=[str(path) for path in sorted(Path("src/rol").rglob("[!.]*.py"))],
+        pages=[path for path in found("book/**/*") if Path(path).is_file()],
+        modules=found("src/**/*.py"),
         stage=["workflow/stage_book.py", "workflow/toolbox_pages.py", "workflow/check.py"],
-        reference=[str(path) for path in sorted(Path("data/reference").glob("[!.]*.json"))],
+        reference=found("data/reference/*.json"),
     output:
         f"{BOOK}/_build/html/index.html",
     log:
@@ -121,87 +223,56 @@ rule chapters:
         [run.path(OUT) for run in RUNS],
 
 
-rule virtual_session:
+rule simulated_session:
     output:
         SESSIONS_ROOT + "/{session}/session.json",
     log:
         SESSIONS_ROOT + "/{session}.log",
     params:
         recipe=lambda wildcards: json.dumps(recipe(wildcards.session), sort_keys=True),
-        code=chapters.virtual_digest(),
+        code=chapters.module_digest(f"{chapters.SIMULATOR}.__main__"),
         made=SESSIONS_ROOT + "/{session}",
     message:
-        "virtual session {wildcards.session}"
+        "simulated session {wildcards.session}"
     shell:  # the writer goes on with what is there, which is right after a stop and wrong after a change of its code
         'made={params.made:q}; [ "$(cat "$made.code" 2>/dev/null)" = {params.code} ] '
         """|| ! grep -qs '"format":' "$made/settings.json" || rm -rf "$made"; """
         'echo {params.code} > "$made.code"; '
-        + ENVIRONMENT + "{PYTHON:q} -m rol.virtual {CONFIG_FILE:q} --session {wildcards.session:q} --out {SESSIONS_ROOT:q} "
+        + ENVIRONMENT + "{PYTHON:q} -m {chapters.SIMULATOR} {CONFIG_FILE:q} --session {wildcards.session:q} --out {SESSIONS_ROOT:q} "
         "> {log:q} 2>&1 || {{ tail -n 30 {log:q}; exit 1; }}"
 
 
-rule sessions:
-    input:
-        notebook=source("01_sessions"),
-        sessions=[session_made(session) for session in SESSIONS],
-    output:
-        notebook=executed("01_sessions"),
-    log:
-        **logs("01_sessions"),
-    params:
-        arguments=arguments("01_sessions"),
-        code=DIGESTS["01_sessions"],
-    message:
-        "01 sessions"
-    shell:
-        PAPERMILL
+for name, (chapter, message, reads, writes) in STEPS.items():
 
-
-rule alignment:
-    input:
-        notebook=source("02_alignment"),
-        session=lambda wildcards: session_made(wildcards.session),
-    output:
-        notebook=executed("02_alignment"),
-        alignment=OUT + "/alignment/{session}/alignment.csv",
-    log:
-        **logs("02_alignment"),
-    params:
-        arguments=arguments("02_alignment"),
-        code=DIGESTS["02_alignment"],
-    message:
-        "02 alignment, {wildcards.session}"
-    shell:
-        PAPERMILL
-
-
-rule ground_removal:
-    input:
-        notebook=source("03_ground_removal"),
-        session=lambda wildcards: session_made(wildcards.session),
-        alignment=OUT + "/alignment/{session}/alignment.csv",
-    output:
-        notebook=executed("03_ground_removal"),
-        pairs=OUT + "/pairs/{session}/pairs.json",
-        corrected=OUT + "/pairs-corrected/{session}/pairs.json",
-    log:
-        **logs("03_ground_removal"),
-    params:
-        arguments=arguments("03_ground_removal"),
-        code=DIGESTS["03_ground_removal"],
-    message:
-        "03 ground removal, {wildcards.session}"
-    shell:
-        PAPERMILL
+    rule:
+        name:
+            name
+        input:
+            notebook=source(chapter),
+            **reads,
+        output:
+            notebook=executed(chapter),
+            **writes,
+        log:
+            **logs(chapter),
+        params:
+            arguments=arguments(chapter),
+            code=DIGESTS[chapter],
+            before=BEFORE.get(name, ""),
+        priority: PRIORITIES.get(name, 0)
+        message:
+            f"{chapter[:2]} {message}"
+        shell:
+            "{params.before}" + PAPERMILL
 
 
 rule pix2pix:
     input:
         notebook=source("04_pix2pix"),
-        pairs=f"{OUT}/pairs/{TRAIN}/pairs.json",
+        pairs=PAIRS.format(session=TRAIN),
     output:
         notebook=executed("04_pix2pix"),
-        weights=f"{OUT}/pix2pix/generator.safetensors",
+        weights=NETWORK,
     log:
         **logs("04_pix2pix"),
     params:
@@ -220,10 +291,10 @@ rule pix2pix:
 
 rule generated_images:
     input:
-        pairs=OUT + "/pairs/{session}/pairs.json",
+        pairs=PAIRS,
         weights=TRANSLATION["weights"],
     output:
-        OUT + "/fake/{session}/fake.json",
+        GENERATED,
     log:
         OUT + "/logs/generated_images/{session}.log",
     params:
@@ -234,169 +305,7 @@ rule generated_images:
     priority: 1
     message:
         "generated images, {wildcards.session}"
-    shell:  # continues with the images of a stopped run; those of other code are removed
-        'made={params.out:q}; [ "$(cat "$made.code" 2>/dev/null)" = {params.code} ] '
-        """|| ! grep -qs '"listing": "fake.json"' "$made/settings.json" """
-        """|| find "$made" -maxdepth 1 -name '[0-9]*.png' -delete; """
-        'echo {params.code} > "$made.code"; '
+    shell:
+        clear_images("{params.out:q}", "fake.json", "{params.code}")
         + ENVIRONMENT + "OMP_NUM_THREADS={threads} {PYTHON:q} workflow/generate_images.py {params.pairs:q} {input.weights:q} "
         "{params.out:q} --threads {threads} {params.options} > {log:q} 2>&1 || {{ tail -n 30 {log:q}; exit 1; }}"
-
-
-rule real_vs_fake:
-    input:
-        notebook=source("05_real_vs_fake"),
-        pairs=expand(OUT + "/pairs/{session}/pairs.json", session=SESSIONS),
-        corrected=expand(OUT + "/pairs-corrected/{session}/pairs.json", session=LOCALIZE),
-        fake=expand(OUT + "/fake/{session}/fake.json", session=SESSIONS),
-        weights=f"{OUT}/pix2pix/generator.safetensors",
-        shipped=SHIPPED,
-    output:
-        notebook=executed("05_real_vs_fake"),
-        similarity=expand(OUT + "/similarity/{session}.json", session=SESSIONS),
-    log:
-        **logs("05_real_vs_fake"),
-    params:
-        arguments=arguments("05_real_vs_fake"),
-        code=DIGESTS["05_real_vs_fake"],
-    priority: 1
-    message:
-        "05 real against fake"
-    shell:
-        PAPERMILL
-
-
-rule ground_truth:
-    input:
-        notebook=source("06_ground_truth"),
-        sessions=[session_made(session) for session in SESSIONS],
-        alignment=expand(OUT + "/alignment/{session}/alignment.csv", session=SESSIONS),
-    output:
-        notebook=executed("06_ground_truth"),
-        summary=f"{OUT}/maps/summary.json",
-        maps=expand(OUT + "/maps/{session}.npz", session=SESSIONS),
-        truth=expand(OUT + "/ground_truth/{session}.tum", session=SESSIONS),
-    log:
-        **logs("06_ground_truth"),
-    params:
-        arguments=arguments("06_ground_truth"),
-        code=DIGESTS["06_ground_truth"],
-    message:
-        "06 ground truth"
-    shell:
-        PAPERMILL
-
-
-rule localization:
-    input:
-        notebook=source("07_localization"),
-        fake=OUT + "/fake/{session}/fake.json",
-        corrected=OUT + "/pairs-corrected/{session}/pairs.json",
-        summary=f"{OUT}/maps/summary.json",
-        map=f"{OUT}/maps/{TRAIN}.npz",
-        truth=OUT + "/ground_truth/{session}.tum",
-    output:
-        notebook=executed("07_localization"),
-        metrics=OUT + "/localization/{session}/{method}/metrics.json",
-    log:
-        **logs("07_localization"),
-    params:
-        arguments=arguments("07_localization"),
-        code=DIGESTS["07_localization"],
-    message:
-        "07 localization, {wildcards.session}, {wildcards.method}"
-    shell:
-        PAPERMILL
-
-
-rule results:
-    input:
-        notebook=source("08_results"),
-        metrics=expand(OUT + "/localization/{session}/{method}/metrics.json", session=LOCALIZE, method=METHODS),
-        summary=f"{OUT}/maps/summary.json",
-        tables=[str(path) for path in sorted(Path("data/paper").glob("[!.]*.csv"))],
-    output:
-        notebook=executed("08_results"),
-    log:
-        **logs("08_results"),
-    params:
-        arguments=arguments("08_results"),
-        code=DIGESTS["08_results"],
-    message:
-        "08 results"
-    shell:
-        PAPERMILL
-
-
-rule oxford_route:
-    input:
-        notebook=source("09_oxford_route"),
-        tables=[str(path) for path in sorted(Path("data/paper").glob("[!.]*.csv"))],
-        measured=[str(path) for path in sorted(Path("data/ablations").glob("route_*.csv"))],
-    output:
-        notebook=executed("09_oxford_route"),
-    log:
-        **logs("09_oxford_route"),
-    params:
-        arguments=arguments("09_oxford_route"),
-        code=DIGESTS["09_oxford_route"],
-    priority: -1  # needs no other chapter, so it fills gaps
-    message:
-        "09 the real route"
-    shell:
-        PAPERMILL
-
-
-rule real_radar:
-    input:
-        notebook=source("10_real_radar"),
-        weights=f"{OUT}/pix2pix/generator.safetensors",
-        shipped=SHIPPED,
-    output:
-        notebook=executed("10_real_radar"),
-    log:
-        **logs("10_real_radar"),
-    params:
-        arguments=arguments("10_real_radar"),
-        code=DIGESTS["10_real_radar"],
-    message:
-        "10 real radar"
-    shell:
-        PAPERMILL
-
-
-rule ablations:
-    input:
-        notebook=source("11_ablations"),
-        tables=[str(path) for path in sorted(Path("data/ablations").glob("[!.]*.csv"))],
-        cards=[path.replace(".safetensors", ".json") for path in SHIPPED],
-    output:
-        notebook=executed("11_ablations"),
-    log:
-        **logs("11_ablations"),
-    params:
-        arguments=arguments("11_ablations"),
-        code=DIGESTS["11_ablations"],
-    priority: -1
-    message:
-        "11 ablations"
-    shell:
-        PAPERMILL
-
-
-rule performance:
-    input:
-        notebook=source("12_performance"),
-        measured=[str(path) for path in sorted(Path("data/performance").glob("[!.]*.json"))],
-    output:
-        notebook=executed("12_performance"),
-    log:
-        **logs("12_performance"),
-    params:
-        arguments=arguments("12_performance"),
-        code=DIGESTS["12_performance"],
-    priority: -1
-    message:
-        "12 performance"
-    shell:
-        PAPERMILL

@@ -3,7 +3,7 @@
 python benchmarks/filter.py [--rounds 25] [--real-root DIR]      prints a table and writes data/performance/filter.json
 
 "numpy" weighs all pairs of particle and point at once, as one writes it without a compiler; its matrix products stay on one
-thread, like the rest of it. "one thread" and "all threads" are `rol.mcl.count_matches`. Ways and sizes take turns, so that
+thread, like the rest of it. "one thread" is `rol.mcl.count_matches`, "all threads" the same in parts. Ways and sizes take turns, so that
 a busy machine hurts all alike; medians, by the clock and of the processors' working time, which others on the machine
 lengthen less. Tracked particles lie within a metre or two of the pose, as after a few scans; spread ones within 150 m to
 each side and with any heading, so that hardly two read the same part of the map. Without the real lidar map, streets of the
@@ -28,11 +28,14 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 from translator import ROOT, describe_machine, take_turns
 
-from rol import mcl, rall
+from rol import mcl
+from rol.compiled import compiled
 from rol.files import write_text
 from rol.geometry import invert, transform_points
 from rol.mcl import MapGrid
-from rol.parameters import positive
+from rol_beyond.likelihood_field import build_likelihood_field
+from rol_book.parameters import positive
+from rol_data import rall
 
 CELLS = (0.5, 0.25, 0.125)  # sides of a cell [m]
 RANGE = 64.0  # of the translator's points [m]
@@ -83,12 +86,29 @@ def count_with_numpy(particles: np.ndarray, points: np.ndarray, grid: MapGrid) -
     return np.sum(grid.values.ravel().take(cells, mode="clip") * is_inside, axis=1)
 
 
+@compiled(parallel=True)
+def _sum_in_parts(particles, points, values, x0, y0, cell, n_parts):
+    """Divide the particles into parts, one for each thread."""
+    n = particles.shape[0]
+    sums = np.empty(n, dtype=np.int64)
+    for part in numba.prange(n_parts):
+        first, end = part * n // n_parts, (part + 1) * n // n_parts
+        sums[first:end] = mcl._sum_values(particles[first:end], points, values, x0, y0, cell)
+    return sums
+
+
+def count_with_threads(particles: np.ndarray, points: np.ndarray, grid: MapGrid) -> np.ndarray:
+    """Count matches with all of numba's threads."""
+    given = map(np.ascontiguousarray, (particles, points, grid.values))
+    return _sum_in_parts(*given, *map(float, grid.origin), float(grid.cell), numba.get_num_threads())
+
+
 def ways_to_weigh(particles: np.ndarray, points: np.ndarray, grid: MapGrid) -> dict[str, Callable]:
-    """Give our two ways of one weighing."""
-    given = particles, points, grid.values, grid.origin, grid.cell
+    """List the compiled ways of weighting."""
+    given = particles, points, grid
     return {
         "one thread": partial(mcl.count_matches, *given),
-        "all threads": partial(mcl.count_matches, *given, parallel=True),
+        "all threads": partial(count_with_threads, *given),
     }
 
 
@@ -134,14 +154,14 @@ def time_weighings(draw: Callable, grid: MapGrid, rounds: int) -> dict[str, dict
 
 def time_updates(draw: Callable, grid: MapGrid, rounds: int) -> dict[str, dict[str, float]]:
     """One scan's update of the method `paper`, whole and in two parts."""
-    settings, rng, rows = mcl.settings_for("paper"), np.random.default_rng(2), {}
+    settings, rng, rows = mcl.MclSettings(), np.random.default_rng(2), {}
     weights = np.full(settings.n_particles, 1.0 / settings.n_particles)
     for m in (400, 2000):
         particles, points = draw(settings.n_particles, m)
-        move = partial(mcl.predict, particles, np.array([2.0, 0.0, 0.02]), settings, rng)
+        move = partial(mcl.predict, particles, np.array([2.0, 0.0, 0.02]), settings.motion, rng)
 
         def update(move=move, points=points):
-            return mcl.update(0, move(), weights, points, grid, settings, rng)
+            return mcl.update(move(), weights, points, grid, settings, rng)
 
         rows[f"update, {settings.n_particles} x {m}"] = {
             "whole": update,
@@ -186,12 +206,12 @@ def time_maps(
 
 
 def time_builds(map_points: np.ndarray, rounds: int) -> dict[str, dict[str, float]]:
-    """Build the grid of the whole map, for both likelihoods."""
+    """Build the grid of the whole map, for both measurements."""
     rows = {}
     for cell in CELLS:
         rows[f"building, {cell} m"] = {
             "matched cells": partial(mcl.build_matched_grid, map_points, cell=cell),
-            "distances": partial(mcl.build_distance_grid, map_points, cell=cell),
+            "distances": partial(build_likelihood_field, map_points, cell=cell),
         }
     return time_rows(rows, rounds)
 

@@ -3,7 +3,7 @@
 python benchmarks/odometry.py [--results build/demo] [--sessions data/sessions/demo] [--real-root DIR]
                                                         prints a table and writes data/performance/odometry.json
 
-All get the same fake clouds of the virtual sessions that `make book` left, and one thread. The paper's ICP and the
+All get the same fake clouds of the simulated sessions that `make book` left, and one thread. The paper's ICP and the
 peers align each cloud to the one before and guess that the car goes on as it went; ours aligns it to the clouds of the
 last metres. Ways take turns scan by scan, so that a busy machine hurts all alike; medians. All that a way makes of a
 cloud is timed with it: trees, normals, corrections, copies into its own types. Drift is that of the KITTI benchmark,
@@ -15,7 +15,7 @@ that were corrected before with the velocities it found.
 two neighbours are equally near.
 
 Beside them stands what is published of the real route: the authors' own odometry there, as it is and with its steps as
-much longer as a range bin is measured longer than the data set's kit has it; and CFEAR-3, a method for raw radar. Where
+much longer as a range bin is measured longer than the data set's SDK has it; and CFEAR-3, a method for raw radar. Where
 small_gicp is not installed (it has no wheels for some kinds of macOS), its rows are left out; without the real data,
 the authors'.
 """
@@ -42,14 +42,16 @@ import open3d as o3d
 from scipy.spatial import cKDTree
 from translator import ROOT, describe_machine
 
-from rol import rall
 from rol.bev import image_to_points
 from rol.evaluation import KITTI_LENGTHS_M, drift_by_length, pose_errors, read_tum, rmse
-from rol.fakes import list_fakes, read_image
 from rol.files import write_text
-from rol.geometry import accumulate_steps, compose, relative_pose, transform_points
-from rol.odometry import chain, correct_cloud, fit_rigid, icp_2d, local_map_odometry
-from rol.radar import KIT_RANGE_RESOLUTION, MEASURED_RANGE_RESOLUTION
+from rol.geometry import accumulate_increments, compose, relative_pose, transform_points
+from rol.odometry import fit_rigid, icp_2d, scan_to_scan_icp
+from rol.pairs import generated_folder, read_image
+from rol.radar import MEASURED, SDK
+from rol_beyond.local_map_odometry import deskew_cloud, local_map_odometry
+from rol_beyond.scan_matching import correlative_scan_match
+from rol_data import rall
 
 try:
     import small_gicp
@@ -59,7 +61,7 @@ except ImportError:
 CFEAR_PCT = (
     1.3  # drift of CFEAR-3 from Oxford's raw radar, sessions of its authors' choice (Adolfsson et al. 2023)
 )
-LONGER = MEASURED_RANGE_RESOLUTION / KIT_RANGE_RESOLUTION  # a range bin as measured, beside the kit's
+LONGER = MEASURED.resolution_m / SDK.resolution_m  # length of a range bin as measured over the SDK's
 REAL_SESSIONS = {"01": "2019-01-10-11-46-21", "02": "2019-01-10-12-32-52", "07": "2019-01-11-12-26-55"}
 MAX_DISTANCE_M = 1.0  # of a pair, for the peers: our ICP's last limit; with 2 or 3 m they drift more
 ITERATIONS = 30  # at most, for all
@@ -86,7 +88,7 @@ def to_step(matrix: np.ndarray) -> np.ndarray:
 def chain_peer(
     align: Align, clouds: Clouds, stamps_us: np.ndarray, heights: tuple[float, ...] = (0.0,)
 ) -> Steps:
-    """Register each cloud to the one before with a peer, as `rol.odometry.chain` does."""
+    """Register each cloud to the one before with a peer, as `rol.odometry.scan_to_scan_icp` does."""
     step, target = np.zeros(3), to_space(clouds[0], heights)
     for cloud in clouds[1:]:
         source = to_space(cloud, heights)
@@ -127,7 +129,8 @@ def ours(clouds: Clouds, stamps_us: np.ndarray, **changes: object) -> Steps:
 
 def paper(clouds: Clouds, stamps_us: np.ndarray, search: bool = False) -> Steps:
     """Steps of the paper's ICP, with or without a searched first guess."""
-    return (r.T_target_source for r in chain(clouds, search=search))
+    refine = correlative_scan_match if search else None
+    return (r.T_target_source for r in scan_to_scan_icp(clouds, refine_guess=refine))
 
 
 def paper_by_tree(clouds: Clouds, stamps_us: np.ndarray) -> Steps:
@@ -165,7 +168,7 @@ def list_ways() -> dict[str, Way]:
         "paper, k-d tree": paper_by_tree,
         "paper, searched guess": partial(paper, search=True),
         "ours": ours,
-        "ours, no correction": partial(ours, correct=None),
+        "ours, no correction": partial(ours, deskew=None),
         "Open3D point-to-point": partial(chain_peer, align_open3d),
     }
     for kind, heights in PEER_HEIGHTS_M.items() if small_gicp else ():
@@ -173,23 +176,26 @@ def list_ways() -> dict[str, Way]:
     return ways
 
 
-def load_session(fakes: Path, session: Path) -> tuple[Clouds, np.ndarray, np.ndarray]:
-    """Clouds of the fake images, their stamps [us], and the true poses at mid-scan."""
-    listed_us, how = list_fakes(fakes)
+def load_session(generated: Path, session: Path) -> tuple[Clouds, np.ndarray, np.ndarray]:
+    """Clouds of the generated images, their stamps [us], and the true poses at mid-scan."""
+    images = generated_folder(generated)
+    about = images.read()
     if not (session / "truth.tum").is_file():
         raise ValueError(f"{session / 'truth.tum'}: missing; `make book` makes the session")
     stamps_us, truth = read_tum(session / "truth.tum")
-    is_listed = np.isin(stamps_us, listed_us)
+    is_listed = np.isin(stamps_us, about["stamps_us"])
     stamps_us = stamps_us[is_listed]
-    clouds = [image_to_points(read_image(fakes / f"{us}.png"), **how) for us in stamps_us.tolist()]
+    clouds = [image_to_points(read_image(images.path(us)), **about["points"]) for us in stamps_us.tolist()]
     return clouds, stamps_us, truth[is_listed]
 
 
 def find_sessions(results: Path, sessions: Path) -> dict[str, tuple[Clouds, np.ndarray, np.ndarray]]:
-    """Load every localization session that has fakes."""
-    folders = sorted(path.parent for path in (results / "fake").glob("virtual-*-seq*/fake.json"))
+    """Load every localization session that has generated images."""
+    folders = sorted(path.parent for path in (results / "fake").glob("sim-*-seq*/fake.json"))
     if not folders:
-        raise ValueError(f"{results / 'fake'}: no fakes of sessions virtual-*-seq*; `make book` makes them")
+        raise ValueError(
+            f"{results / 'fake'}: no generated images of sessions sim-*-seq*; `make book` makes them"
+        )
     return {folder.name: load_session(folder, sessions / folder.name) for folder in folders}
 
 
@@ -208,7 +214,7 @@ def take_turns(ways: dict[str, Steps], n_steps: int) -> tuple[dict[str, np.ndarr
 def judge(steps: np.ndarray, truth: np.ndarray, longest_m: float) -> dict[str, float]:
     """Drift over stretches up to a length, and the errors of single steps."""
     lengths_m = tuple(length for length in KITTI_LENGTHS_M if length <= longest_m)
-    report = drift_by_length(accumulate_steps(steps), truth, lengths_m)
+    report = drift_by_length(accumulate_increments(steps), truth, lengths_m)
     errors = pose_errors(steps, relative_pose(truth[:-1], truth[1:]))
     return {
         "drift [%]": report.mean_translation_pct,
@@ -223,7 +229,7 @@ def judge(steps: np.ndarray, truth: np.ndarray, longest_m: float) -> dict[str, f
 def correct_all(clouds: Clouds, stamps_us: np.ndarray) -> Clouds:
     """Correct clouds with the velocities that ours finds."""
     twists = [found.twist for found in local_map_odometry(clouds, stamps_us)]
-    return [correct_cloud(c, twist) for c, twist in zip(clouds, [twists[0], *twists], strict=True)]
+    return [deskew_cloud(c, twist) for c, twist in zip(clouds, [twists[0], *twists], strict=True)]
 
 
 def find_longest(truths: list[np.ndarray]) -> float:

@@ -1,9 +1,9 @@
-"""How fast virtual sensors are, and where the time goes.
+"""How fast simulated sensors are, and where the time goes.
 
 python benchmarks/simulator.py [--scans 40]      prints a table and writes build/benchmarks/simulator.json
 
-Medians over scans of one process on one thread; the sessions of a drive are written by as many processes as wanted. With
-the real data at hand the world is that of the route, without them the virtual town.
+Medians over scans of one process on one thread; the sessions of a trajectory are written by as many processes as wanted. With
+the real data at hand the world is that of the route, without them the simulated town.
 """
 
 from __future__ import annotations
@@ -17,17 +17,20 @@ from time import perf_counter
 
 import numpy as np
 
-from rol import oxford, rall
 from rol.files import write_text
-from rol.parameters import positive
-from rol.virtual import radar_sensor, radar_signal
-from rol.virtual.session import VirtualSession, build_session, make_scan, make_sweep, sensor_settings
-from rol.virtual.settings import load_settings
+from rol.oxford import VelodyneRaw
+from rol_book.parameters import positive
+from rol_data import rall
+from rol_sim.sensors import radar as radar_sensor
+from rol_sim.sensors import radar_signal
+from rol_sim.session import oxford_files
+from rol_sim.session.settings import load_settings, sensor_settings
+from rol_sim.session.simulation import SimulatedSession, build_session, make_scan, make_sweep
 
 ROOT = Path(__file__).resolve().parents[1]
 
 
-def open_drive() -> tuple[VirtualSession, float]:
+def build_benchmark_session() -> tuple[SimulatedSession, float]:
     """Build a session of the route, or of the town without the real data; gives also the seconds it took."""
     config = "route" if rall.find_real_root() else "demo"
     settings = load_settings(ROOT / "config" / f"{config}.yaml")
@@ -36,7 +39,7 @@ def open_drive() -> tuple[VirtualSession, float]:
     return session, perf_counter() - begin
 
 
-def time_scan(session: VirtualSession, index: int, folder: Path) -> dict[str, float]:
+def time_scan(session: SimulatedSession, index: int, folder: Path) -> dict[str, float]:
     """Time the parts of one radar scan [ms]."""
     settings = sensor_settings(session.settings)[1]
     stamp, turn = int(session.scans_us[index]), int(session.turns_us[index])
@@ -45,7 +48,7 @@ def time_scan(session: VirtualSession, index: int, folder: Path) -> dict[str, fl
     marks = [perf_counter()]
     scene = session.scene_at(stamp + 0.5 * turn)
     marks.append(perf_counter())
-    rays = radar_sensor.emit_rays(session.drive.pose(times), rng, settings)
+    rays = radar_sensor.emit_rays(session.trajectory.pose(times), rng, settings)
     marks.append(perf_counter())
     rows, ranges, powers, _, _ = radar_sensor.trace_echoes(scene, rays, settings)
     marks.append(perf_counter())
@@ -54,31 +57,31 @@ def time_scan(session: VirtualSession, index: int, folder: Path) -> dict[str, fl
     scan = make_scan(session, index)
     whole = perf_counter() - marks[-1]
     begin = perf_counter()
-    oxford.save_radar(folder / f"{scan.stamp_us}.png", scan)
+    oxford_files.save_radar(folder / f"{scan.stamp_us}.png", scan)
     written = perf_counter() - begin
-    assert codes.shape == scan.codes.shape
+    assert codes.shape == scan.power.shape
     names = ("traffic", "rays sent", "rays traced", "signal")
     parts = dict(zip(names, np.diff(marks), strict=True))
     found = {**parts, "file written": written, "whole scan": whole + written, "echoes": len(rows) / 1000.0}
     return {name: 1000.0 * float(value) for name, value in found.items()}
 
 
-def time_sweep(session: VirtualSession, index: int, folder: Path) -> dict[str, float]:
+def time_sweep(session: SimulatedSession, index: int, folder: Path) -> dict[str, float]:
     """Time one lidar sweep [ms]."""
     begin = perf_counter()
     sweep = make_sweep(session, "velodyne_left", index)
     made = perf_counter()
-    raw = oxford.VelodyneRaw(sweep.intensities, sweep.ranges, sweep.angles, sweep.stamps_us)
-    oxford.save_velodyne_raw(folder / "sweep.png", raw)
+    raw = VelodyneRaw(sweep.intensities, sweep.ranges, sweep.angles, sweep.stamps_us)
+    oxford_files.save_velodyne_raw(folder / "sweep.png", raw)
     return {"sweep": 1000.0 * (made - begin), "sweep written": 1000.0 * (perf_counter() - made)}
 
 
 def main() -> None:
     """Measure, print, and write the table."""
-    parser = argparse.ArgumentParser(description="How fast virtual sensors are, and where the time goes.")
+    parser = argparse.ArgumentParser(description="How fast simulated sensors are, and where the time goes.")
     parser.add_argument("--scans", type=positive, default=40)
     given = parser.parse_args()
-    session, built_s = open_drive()
+    session, built_s = build_benchmark_session()
     indices = np.linspace(5, len(session.scans_us) - 5, given.scans).astype(int)
     with tempfile.TemporaryDirectory() as folder:
         time_scan(session, int(indices[0]), Path(folder))  # compiles

@@ -26,17 +26,17 @@ import scipy
 import torch
 from scipy.ndimage import map_coordinates
 
+import rol_beyond.unet  # noqa: F401 (registers the architecture)
 from rol.bev import image_to_points
 from rol.files import write_text
-from rol.parameters import positive
-from rol.pix2pix import TrainConfig, build_generator, generate, has_bf16, load_weights
-from rol.radar import polar_to_cartesian
+from rol.pix2pix import TrainConfig, build_generator, generate, has_bf16, load_weights, train_step
+from rol.radar import SDK, polar_to_cartesian
 from rol.similarity import nn_distances
 from rol.training import TrainingState
-from rol.unet import fuse
+from rol_book.parameters import positive
 
 ROOT = Path(__file__).resolve().parents[1]
-SHIPPED = ROOT / "data" / "weights" / "rol.safetensors"
+SHIPPED = ROOT / "data" / "weights" / "unet.safetensors"
 
 
 def draw_image(rng: np.random.Generator) -> np.ndarray:
@@ -68,7 +68,7 @@ def time_use(name: str, network: torch.nn.Module, image: np.ndarray, rounds: int
     """Time one image through both, and say how far their points are apart."""
     plain, ours = make_plain(network.eval()), copy.deepcopy(network).eval()
     if name == "unet":
-        fuse(ours)
+        ours.fuse()
     ways = {"plain": lambda: generate(plain, image), "ours": lambda: generate(ours, image, bf16=has_bf16())}
     found = take_turns(ways, rounds)
     grey = [generate(plain, image).astype(int), generate(ours, image, bf16=has_bf16()).astype(int)]
@@ -84,10 +84,6 @@ def time_use(name: str, network: torch.nn.Module, image: np.ndarray, rounds: int
 
 def time_step(config: TrainConfig, rounds: int) -> dict[str, float]:
     """Time one step of training, batch 1, both networks of the paper."""
-    from dataclasses import replace
-
-    from rol.pix2pix import train_step
-
     rng = np.random.default_rng(1)
     pair = [torch.from_numpy(draw_image(rng)[None, None].astype(np.float32) / 127.5 - 1.0) for _ in range(2)]
     states = {"plain": TrainingState(config, seed=1), "ours": TrainingState(config, seed=1)}
@@ -95,8 +91,8 @@ def time_step(config: TrainConfig, rounds: int) -> dict[str, float]:
         network.to(memory_format=torch.contiguous_format)
     ways = {}
     for name, state in states.items():
-        used = replace(config, bf16=name == "ours" and has_bf16())
-        ways[name] = lambda state=state, used=used: train_step(*state.parts, *pair, used)
+        how = {"lambda_l1": config.lambda_l1, "bf16": name == "ours" and has_bf16()}
+        ways[name] = lambda state=state, how=how: train_step(state.networks, state.optimizers, *pair, **how)
     return compare(take_turns(ways, rounds))
 
 
@@ -105,7 +101,7 @@ def warp_with_scipy(codes: np.ndarray, azimuths: np.ndarray) -> np.ndarray:
     axis = np.linspace(63.875, -63.875, 512)
     x, y = np.meshgrid(axis, axis, indexing="ij")
     rows = np.mod(azimuths[0] - np.arctan2(y, x), 2.0 * np.pi) / (azimuths[0] - azimuths[1])
-    bins = np.hypot(x, y) / 0.0432 - 0.5
+    bins = np.hypot(x, y) / SDK.resolution_m - 0.5
     return map_coordinates(codes / 255.0, [rows, bins], order=1, mode="nearest")
 
 
@@ -179,21 +175,21 @@ def main() -> None:
     parser = argparse.ArgumentParser(description="How fast the translator is, beside the plain way.")
     parser.add_argument("--rounds", type=positive, default=7)
     parser.add_argument("--threads", type=positive, default=2)
-    parser.add_argument("--filters", type=positive, default=64, help="width of the paper's network")
+    parser.add_argument("--ngf", type=positive, default=64, help="width of the paper's network")
     given = parser.parse_args()
     torch.set_num_threads(given.threads)
     image, rng = draw_image(np.random.default_rng(0)), torch.Generator().manual_seed(1)
     shipped = load_weights(SHIPPED) if SHIPPED.is_file() else None
-    width = (shipped.filters, shipped.blocks) if shipped is not None else (32, 1)
+    width = (shipped.ngf, shipped.n_blocks) if shipped is not None else (32, 1)
     table = {
-        f"use, resnet {given.filters}": time_use(
-            "resnet", build_generator(given.filters, rng=rng), image, given.rounds
+        f"use, resnet {given.ngf}": time_use(
+            "resnet", build_generator(given.ngf, rng=rng), image, given.rounds
         ),
         f"use, unet {width[0]}": time_use(
             "unet", build_generator(*width, "unet", rng=rng), image, given.rounds
         ),
-        f"step, resnet {given.filters}": time_step(
-            TrainConfig(filters=given.filters, discriminator_filters=given.filters), max(given.rounds // 3, 1)
+        f"step, resnet {given.ngf}": time_step(
+            TrainConfig(ngf=given.ngf, ndf=given.ngf), max(given.rounds // 3, 1)
         ),
         "polar to image": time_polar(given.rounds),
         "image to points": time_points(max(given.rounds // 3, 1)),

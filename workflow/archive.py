@@ -18,13 +18,13 @@ import tarfile
 import time
 import zipfile
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import yaml
 
 from chapters import CHAPTERS, ROOT, all_runs, code_cells, load_config, read_notebook
+from rol.files import write_bytes
 
 RESULTS = {".csv", ".json", ".tum"}  # metrics, tables and trajectories
 NOT_RESULTS = {"logs", "notebooks"}  # folders of out_dir without results
@@ -38,13 +38,12 @@ class ArchiveError(RuntimeError):
     """Raised if something that belongs into the archive is missing or out of date; names it and the remedy."""
 
 
-@dataclass(frozen=True)
-class Job:
+class Job(NamedTuple):
     """A finished job of the workflow: its rule, what it read and wrote, and its command."""
 
     rule: str
-    inputs: tuple[str, ...]
-    outputs: tuple[str, ...]
+    inputs: list[str]
+    outputs: list[str]
     command: str
 
 
@@ -92,10 +91,9 @@ def parse_summary(table: str, profile: str) -> list[Job]:
             faults.append((output, "missing" if status == "missing" else "out of date"))
             continue
         command = PROGRAM.sub(lambda found: found[1] or found[2], command).partition(" || {")[0]
-        name = (rule, output if logs == "-" else logs)
-        before = jobs[name].outputs if name in jobs else ()
-        read = tuple(path for path in inputs.split(",") if path not in ("", "-"))
-        jobs[name] = Job(rule, read, (*before, output), command)
+        read = [path for path in inputs.split(",") if path not in ("", "-")]
+        job = jobs.setdefault((rule, output if logs == "-" else logs), Job(rule, read, [], command))
+        job.outputs.append(output)
     if faults:
         more = f" (and {len(faults) - 1} more)" if faults[1:] else ""
         raise ArchiveError(
@@ -108,13 +106,8 @@ def parse_summary(table: str, profile: str) -> list[Job]:
 def find_results(root: Path, config: Mapping[str, Any]) -> list[str]:
     """List the metrics, tables and trajectories of a build, as paths of the project."""
     out, book = root / config["out_dir"], root / config["book_dir"]
-    found = [
-        path
-        for path in out.rglob("*")
-        if path.suffix in RESULTS
-        and path.relative_to(out).parts[0] not in NOT_RESULTS
-        and book not in path.parents
-    ]
+    found = [path for path in out.rglob("*") if path.suffix in RESULTS and book not in path.parents]
+    found = [path for path in found if path.relative_to(out).parts[0] not in NOT_RESULTS]
     return sorted(path.relative_to(root).as_posix() for path in found)
 
 
@@ -175,25 +168,14 @@ def describe(files: Mapping[str, bytes], jobs: Iterable[Job], writers: Mapping[s
     crate.root_dataset["version"] = citation["version"]
     profile = {"@type": "CreativeWork", "name": "Process Run Crate", "version": "0.5"}
     crate.root_dataset["conformsTo"] = crate.add(ContextEntity(crate, PROFILE, profile))
-    names = [
-        author.get("name") or f"{author['given-names']} {author['family-names']}"
-        for author in citation["authors"]
-    ]
-    authors = [
-        ContextEntity(crate, f"#author-{n}", {"@type": "Organization", "name": name})
-        for n, name in enumerate(names)
-    ]
+    authors = [{"@type": "Organization", "name": author["name"]} for author in citation["authors"]]
+    authors = [ContextEntity(crate, f"#author-{n}", author) for n, author in enumerate(authors)]
     crate.root_dataset["author"] = [crate.add(author) for author in authors]
     for job in jobs:
         made = [*job.outputs, *(result for result, writer in writers.items() if writer in job.outputs)]
         add_action(crate, files, job, list(dict.fromkeys(made)))
-    for path in sorted(files):
-        if (
-            Path(path).suffix in RESULTS
-            and path in writers
-            or path in ("README.md", "CITATION.cff", "codecheck.yml")
-        ):
-            entity(crate, files, path)
+    for path in sorted({"README.md", "CITATION.cff", "codecheck.yml", *writers} & set(files)):
+        entity(crate, files, path)
     return json.dumps(crate.metadata.generate(), indent=1, sort_keys=True).encode() + b"\n"
 
 
@@ -265,22 +247,16 @@ def collect(root: Path, config: Mapping[str, Any], jobs: list[Job]) -> tuple[dic
     return files, {name for name, (_, executable) in code.items() if executable}
 
 
-def write_zip(path: Path, files: Mapping[str, bytes], executable: set[str], seconds: int) -> None:
-    """Write a zip whole or not at all, sorted, with one time [s since 1970, UTC] for all files."""
-    part = path.with_suffix(".part")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    try:
-        with zipfile.ZipFile(part, "w", zipfile.ZIP_DEFLATED) as archive:
-            for name in sorted(files):
-                info = zipfile.ZipInfo(name, time.gmtime(seconds)[:6])
-                info.create_system, info.compress_type = 3, zipfile.ZIP_DEFLATED
-                info.external_attr = (0o100755 if name in executable else 0o100644) << 16
-                archive.writestr(info, files[name])
-        part.replace(path)
-    except OSError as error:
-        raise OSError(error.errno, f"cannot write this file: {error.strerror}", str(path)) from error
-    finally:
-        part.unlink(missing_ok=True)
+def make_zip(files: Mapping[str, bytes], executable: set[str], seconds: int) -> bytes:
+    """Make a zip, sorted, with one time [s since 1970, UTC] for all files."""
+    content = io.BytesIO()
+    with zipfile.ZipFile(content, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name in sorted(files):
+            info = zipfile.ZipInfo(name, time.gmtime(seconds)[:6])
+            info.create_system, info.compress_type = 3, zipfile.ZIP_DEFLATED
+            info.external_attr = (0o100755 if name in executable else 0o100644) << 16
+            archive.writestr(info, files[name])
+    return content.getvalue()
 
 
 def pack(root: Path, config: Mapping[str, Any], summary: str) -> Path:
@@ -308,7 +284,7 @@ def pack(root: Path, config: Mapping[str, Any], summary: str) -> Path:
     files, executable = collect(root, config, parse_summary(summary, config["profile"]))
     version = yaml.safe_load(files["CITATION.cff"])["version"]
     path = root / "build" / f"radar-on-lidar-{version}-{config['profile']}.zip"
-    write_zip(path, files, executable, int(run("git", "log", "-1", "--format=%ct", cwd=root)))
+    write_bytes(path, make_zip(files, executable, int(run("git", "log", "-1", "--format=%ct", cwd=root))))
     return path
 
 
@@ -321,10 +297,8 @@ def main(config_file: str) -> int:
     except (ArchiveError, OSError) as error:
         print(f"archive: {error}", file=sys.stderr)
         return 1
-    size = path.stat().st_size / 1e6
-    print(
-        f"The archive: {path.relative_to(ROOT)} ({size:.0f} MB; unzip it into a folder and open index.html)"
-    )
+    size = f"{path.stat().st_size / 1e6:.0f} MB"
+    print(f"The archive: {path.relative_to(ROOT)} ({size}; unzip it into a folder and open index.html)")
     return 0
 
 

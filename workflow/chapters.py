@@ -10,6 +10,7 @@ import ast
 import hashlib
 import io
 import json
+import re
 import shlex
 import tokenize
 from collections.abc import Iterable
@@ -24,7 +25,10 @@ from rol.files import read_text
 
 ROOT = Path(__file__).resolve().parents[1]
 NOTEBOOKS = ROOT / "notebooks"
-PACKAGE = ROOT / "src" / "rol"
+SOURCE = ROOT / "src"  # of all packages
+LOCK = ROOT / "requirements.lock"
+HAVE_DOCSTRING = ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef
+SIMULATOR = "rol_sim"  # writes a simulated session when it is run as a module
 
 # How often a chapter runs: once in all, once for each session, or once for each localization session and method.
 CHAPTERS = {
@@ -41,18 +45,16 @@ CHAPTERS = {
     "11_ablations": "once",
     "12_performance": "once",
 }
-CONFIG_KEYS = {
-    "profile",
+LISTS, FOLDERS = ("sessions", "methods"), ("sessions_root", "out_dir", "book_dir")
+CONFIG_KEYS = {"profile", *LISTS, *FOLDERS, "seed", "notebooks", "simulated"}
+OPTIONAL_KEYS = {"real_root"}
+SHARED = (
     "sessions_root",
     "sessions",
-    "methods",
     "out_dir",
-    "book_dir",
     "seed",
-    "notebooks",
-    "virtual",
-}
-OPTIONAL_KEYS = {"real_root"}
+    "real_root",
+)  # keys that are parameters of notebooks
 
 
 class ChapterError(ValueError):
@@ -94,14 +96,13 @@ def check_config(config: dict, name: str) -> dict:
     missing, unknown = CONFIG_KEYS - set(config), set(config) - CONFIG_KEYS - OPTIONAL_KEYS
     if missing or unknown:
         raise ChapterError(f"{name}: missing keys {sorted(missing)}, unknown keys {sorted(unknown)}")
-    for key in ("sessions", "methods"):
-        if not isinstance(config[key], list) or not all(
-            word and isinstance(word, str) for word in config[key]
-        ):
+    for key in LISTS:
+        words = config[key]
+        if not isinstance(words, list) or not all(word and isinstance(word, str) for word in words):
             raise ChapterError(f"{name}: `{key}` is no list of names")
     if not config["methods"]:
         raise ChapterError(f"{name}: `methods` is empty")
-    for key in ("sessions_root", "out_dir", "book_dir"):
+    for key in FOLDERS:
         if not isinstance(config[key], str) or Path(config[key]) == Path("."):
             raise ChapterError(f"{name}: `{key}` names no folder of its own: {config[key]!r}")
     strangers = set(config["notebooks"] or {}) - set(CHAPTERS)
@@ -109,7 +110,7 @@ def check_config(config: dict, name: str) -> dict:
         raise ChapterError(f"{name}: no such chapters: {sorted(strangers)}")
     if len(config["sessions"]) < 2 or len(set(config["sessions"])) != len(config["sessions"]):
         raise ChapterError(
-            f"{name}: `sessions` needs at least two different names, the training session first"
+            f"{name}: `sessions` needs two or more different names, the training session first"
         )
     return config
 
@@ -191,7 +192,7 @@ def notebook_parameters(path: str | Path) -> dict:
 def run_parameters(config: dict, run: Run, notebooks: Path = NOTEBOOKS) -> dict:
     """Give what papermill passes to a run.
 
-    The common settings go to every notebook that asks for them; the knobs of the profile and the session and method
+    The common settings go to every notebook that asks for them; the parameters of the profile and the session and method
     of the run must be parameters of the notebook (papermill itself would only print a line and go on).
 
     Raises
@@ -201,19 +202,12 @@ def run_parameters(config: dict, run: Run, notebooks: Path = NOTEBOOKS) -> dict:
     """
     path = notebooks / f"{run.chapter}.ipynb"
     known = notebook_parameters(path)
-    common = {
-        key: config[key]
-        for key in ("sessions_root", "sessions", "out_dir", "seed", "real_root")
-        if key in config
-    }
-    common["in_dir"] = config["out_dir"]
+    common = {key: config[key] for key in SHARED if key in config} | {"in_dir": config["out_dir"]}
     own = {key: value for key, value in (("session", run.session), ("method", run.method)) if value}
     own |= (config["notebooks"] or {}).get(run.chapter) or {}
-    unknown = sorted(set(own) - set(known))
+    unknown = ", ".join(sorted(set(own) - set(known)))
     if unknown:
-        raise ChapterError(
-            f"{path}: has no parameter {', '.join(unknown)}; it has {', '.join(sorted(known))}"
-        )
+        raise ChapterError(f"{path}: has no parameter {unknown}; it has {', '.join(sorted(known))}")
     return {key: value for key, value in (common | own).items() if key in known}
 
 
@@ -226,9 +220,8 @@ def translation(config: dict, notebooks: Path = NOTEBOOKS) -> dict[str, str]:
         ``weights``: file of the network; ``options``: arguments, quoted for the shell.
     """
     chapter = "05_real_vs_fake"
-    known = notebook_parameters(notebooks / f"{chapter}.ipynb") | run_parameters(
-        config, Run(chapter), notebooks
-    )
+    defaults = notebook_parameters(notebooks / f"{chapter}.ipynb")
+    known = defaults | run_parameters(config, Run(chapter), notebooks)
     weights = Path(known["weights_root"], f"{known['network']}.safetensors")
     if known["network"] == "chapter 04":
         weights = Path(config["out_dir"], "pix2pix", "generator.safetensors")
@@ -262,95 +255,130 @@ def code_text(source: str) -> str:
             row, column = token.start
             lines[row - 1] = lines[row - 1][:column]
     for node in ast.walk(ast.parse(source)):
-        if isinstance(
-            node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef
-        ) and ast.get_docstring(node):
+        if isinstance(node, HAVE_DOCSTRING) and ast.get_docstring(node):
             first, last = node.body[0].lineno, node.body[0].end_lineno
             lines[first - 1 : last] = [""] * (last - first + 1)
     return "\n".join(line.rstrip() for line in lines if line.strip())
 
 
-def code_cells(notebook: nbformat.NotebookNode) -> list[str]:
-    """List the sources of a notebook's code cells, without the one that papermill put in."""
+def own_code(notebook: nbformat.NotebookNode) -> list[nbformat.NotebookNode]:
+    """List a notebook's code cells, without empty ones and the one that papermill put in."""
     injected = tagged_cells(notebook, "injected-parameters")
-    return [
-        c.source for c in notebook.cells if c.cell_type == "code" and c.source.strip() and c not in injected
-    ]
+    cells = [cell for cell in notebook.cells if cell.cell_type == "code" and cell.source.strip()]
+    return [cell for cell in cells if cell not in injected]
+
+
+def code_cells(notebook: nbformat.NotebookNode) -> list[str]:
+    """List the sources of a notebook's code cells, without empty ones and the one that papermill put in."""
+    return [cell.source for cell in own_code(notebook)]
 
 
 @cache
-def imported_modules(source: str, package: tuple[str, ...] = ()) -> frozenset[tuple[str, ...]]:
-    """List the names below ``rol`` that a piece of source imports, as paths such as ``("virtual", "scene")``.
+def imported_names(source: str, package: tuple[str, ...] = ()) -> frozenset[tuple[str, ...]]:
+    """List the absolute names that a piece of source imports, as paths such as ``("rol", "mcl", "localize")``.
 
     Parameters
     ----------
     source : str
         Python source; lines of IPython's magic are left out.
     package : tuple of str
-        Where the source stands below ``rol``, to resolve relative imports.
+        Package that the source belongs to, to resolve relative imports.
     """
     plain = "\n".join(line for line in source.splitlines() if not line.lstrip().startswith(("%", "!")))
     found = set()
     for node in ast.walk(ast.parse(plain)):
         if isinstance(node, ast.Import):
-            names = [tuple(alias.name.split(".")) for alias in node.names]
+            found |= {tuple(alias.name.split(".")) for alias in node.names}
         elif isinstance(node, ast.ImportFrom):
-            base = tuple(node.module.split(".")) if node.module else ()
-            if node.level:
-                base = ("rol", *package[: len(package) - node.level + 1], *base)
-            names = [base] + [(*base, alias.name) for alias in node.names]
-        else:
-            continue
-        found |= {name[1:] for name in names if name[:1] == ("rol",)}
+            base = package[: len(package) - node.level + 1] if node.level else ()
+            base += tuple(node.module.split(".")) if node.module else ()
+            found |= {(*base, alias.name) for alias in node.names}
     return frozenset(found)
 
 
-def module_files(sources: Iterable[str], package_root: Path = PACKAGE) -> list[Path]:
-    """List the files of ``rol`` that pieces of source use, directly or through one another."""
+def files_of_import(name: tuple[str, ...]) -> list[Path]:
+    """List the files that an import runs, packages first; none if the module or the name in it is missing."""
+    files: list[Path] = []
+    place = SOURCE
+    for n, part in enumerate(name):
+        place = place / part
+        found = [file for file in (place / "__init__.py", place.with_suffix(".py")) if file.is_file()]
+        if not found:  # `part` is a name in the last file, or missing
+            known = ["*", *re.findall(r"\w+", code_text(read_text(files[-1])))] if files else []
+            return files if n == len(name) - 1 and part in known else []
+        files.append(found[0])
+    return files
+
+
+def module_files(sources: Iterable[str], user: str) -> list[Path]:
+    """List the files under ``src`` that pieces of source use, directly or through one another.
+
+    Every folder of ``src`` with an ``__init__.py`` is a package. A name that begins with ``rol`` is always taken for
+    one, so that a package that has been moved or renamed is an error and not left out.
+
+    Parameters
+    ----------
+    sources : iterable of str
+        Python source.
+    user : str
+        File that the sources belong to, for the message of an error.
+
+    Raises
+    ------
+    ChapterError
+        If an import of a package of this project leads to no file; names the importing file and the import.
+    """
+    packages = {file.parent.name for file in SOURCE.glob("[!.]*/__init__.py")}
     found: set[Path] = set()
-    waiting = [name for source in sources for name in imported_modules(source)]
+    waiting = [(user, name) for source in sources for name in imported_names(source)]
     while waiting:
-        name = waiting.pop()
-        for file in (
-            package_root.joinpath(*name, "__init__.py"),
-            package_root.joinpath(*name).with_suffix(".py"),
-        ):
-            if file.is_file() and file not in found:
-                found.add(file)
-                package = file.parent.relative_to(package_root).parts
-                waiting += imported_modules(file.read_text(encoding="utf-8"), package)
+        user, name = waiting.pop()
+        if name[0] not in packages and not name[0].startswith("rol"):
+            continue
+        files = files_of_import(name)
+        if not files:
+            raise ChapterError(
+                f"{user}: imports `{'.'.join(name)}`, which is no module or name under {SOURCE.name}"
+            )
+        for file in set(files) - found:
+            found.add(file)
+            package = file.parent.relative_to(SOURCE).parts
+            waiting += [(str(file), used) for used in imported_names(read_text(file), package)]
     return sorted(found)
 
 
 def digest(texts: Iterable[str]) -> str:
-    """Give a short digest of several texts."""
-    return hashlib.sha256("\0".join(texts).encode()).hexdigest()[:16]
+    """Compute a short digest of several texts and of the versions in the lock file."""
+    versions = [line for line in read_text(LOCK).splitlines() if not line.startswith("#")]
+    return hashlib.sha256("\0".join([*texts, *versions]).encode()).hexdigest()[:16]
+
+
+def code_of(files: Iterable[Path]) -> list[str]:
+    """Read the code of files, without comments and docstrings."""
+    return [code_text(read_text(file)) for file in files]
 
 
 def chapter_digest(path: str | Path) -> str:
-    """Give the digest of a notebook's code and of the modules it uses; text, comments and outputs do not count."""
+    """Compute the digest of a notebook's code, the modules it uses and the lock file; text and outputs do not count."""
     cells = code_cells(read_notebook(path))
-    return digest([*cells, *(code_text(file.read_text(encoding="utf-8")) for file in module_files(cells))])
+    return digest([*cells, *code_of(module_files(cells, str(path)))])
 
 
-def virtual_digest() -> str:
-    """Give the digest of all code that makes virtual sessions."""
-    files = module_files(["import rol.virtual.__main__"])
-    return digest(code_text(file.read_text(encoding="utf-8")) for file in files)
+def module_digest(name: str) -> str:
+    """Compute the digest of a module of the packages, the modules it uses and the lock file."""
+    return digest(code_of(module_files([f"import {name}"], "workflow/chapters.py")))
 
 
 def script_digest(name: str) -> str:
-    """Give the digest of a script of the workflow and of the modules it uses."""
-    script = (ROOT / "workflow" / name).read_text(encoding="utf-8")
-    return digest(
-        code_text(text) for text in [script, *(f.read_text(encoding="utf-8") for f in module_files([script]))]
-    )
+    """Compute the digest of a script of the workflow, the modules it uses and the lock file."""
+    script = ROOT / "workflow" / name
+    return digest(code_of([script, *module_files([read_text(script)], f"workflow/{name}")]))
 
 
 def stored_digest(notebook: nbformat.NotebookNode, config: dict) -> str:
-    """Give the digest that a stored notebook carries: its code, all of ``src/rol``, and the profile it was run with."""
-    package = [code_text(file.read_text(encoding="utf-8")) for file in sorted(PACKAGE.rglob("[!.]*.py"))]
-    return digest([*code_cells(notebook), *package, json.dumps(config, sort_keys=True)])
+    """Compute the digest that a stored notebook carries: of its code, all packages, the lock file and its profile."""
+    packages = code_of(sorted(SOURCE.rglob("[!.]*.py")))
+    return digest([*code_cells(notebook), *packages, json.dumps(config, sort_keys=True)])
 
 
 # ---- executed notebooks ---------------------------------------------------------------------------------------
@@ -388,18 +416,10 @@ def load_run(path: str | Path, source: str | Path) -> nbformat.NotebookNode:
         raise ChapterError(f"{path}: " + "; ".join(faults))
     if code_cells(executed) != code_cells(current):
         raise ChapterError(f"{path}: its code is not that of {source}; run the chapter again")
+    for cell, done in zip(own_code(current), own_code(executed), strict=True):
+        cell.outputs, cell.execution_count = done.outputs, done.execution_count
     injected = tagged_cells(executed, "injected-parameters")
-    ran = iter(
-        [c for c in executed.cells if c.cell_type == "code" and c.source.strip() and c not in injected]
-    )
-    cells = []
-    for cell in current.cells:
-        if cell.cell_type == "code" and cell.source.strip():
-            done = next(ran)
-            cell.outputs, cell.execution_count = done.outputs, done.execution_count
-        cells.append(cell)
-        if "parameters" in cell.metadata.get("tags", []):
-            cells += injected
-    current.cells = cells
+    place = 1 + current.cells.index(tagged_cells(current, "parameters")[0]) if injected else 0
+    current.cells[place:place] = injected
     current.metadata.setdefault("papermill", {}).update(executed.metadata.get("papermill", {}))
     return current

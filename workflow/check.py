@@ -27,7 +27,7 @@ from statistics import fmean
 
 from chapters import ROOT, ChapterError, Run, load_config
 from rol.files import read_text, write_text
-from rol.rall import find_real_root
+from rol_data.rall import find_real_root
 
 REFERENCE = ROOT / "data" / "reference"
 PAGE = ROOT / "book" / "did_it_reproduce.md"
@@ -188,9 +188,8 @@ def renew(config: dict) -> None:
     path = REFERENCE / f"{config['profile']}.json"
     write_text(path, json.dumps(reference, indent=1, ensure_ascii=False) + "\n")
     kept = count_results(rows)[SKIPPED]
-    print(
-        f"renewed: {len(rows) - kept} values of {path.relative_to(ROOT)}; kept: {kept}, which need real data"
-    )
+    renewed = f"renewed: {len(rows) - kept} values of {path.relative_to(ROOT)}"
+    print(f"{renewed}; kept: {kept}, which need real data")
 
 
 # ---- machine --------------------------------------------------------------------------------------------------

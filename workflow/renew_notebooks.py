@@ -14,20 +14,8 @@ from pathlib import Path
 
 import nbformat
 
-from chapters import (
-    CHAPTERS,
-    NOTEBOOKS,
-    ROOT,
-    ChapterError,
-    Run,
-    all_runs,
-    literal_assignments,
-    load_config,
-    load_run,
-    notebook_parameters,
-    stored_digest,
-    tagged_cells,
-)
+import chapters
+from chapters import CHAPTERS, NOTEBOOKS, ROOT, ChapterError, Run, literal_assignments, tagged_cells
 from rol.files import write_text
 
 LARGEST_MB = 1.5
@@ -36,8 +24,8 @@ KEPT_METADATA = ("kernelspec", "language_info")
 
 def default_run(config: dict, chapter: str) -> Run:
     """Find the run of a chapter whose session and method are the notebook's defaults."""
-    defaults = notebook_parameters(NOTEBOOKS / f"{chapter}.ipynb")
-    for run in all_runs(config):
+    defaults = chapters.notebook_parameters(NOTEBOOKS / f"{chapter}.ipynb")
+    for run in chapters.all_runs(config):
         own = {"session": run.session, "method": run.method}
         if run.chapter == chapter and all(defaults.get(key) == value for key, value in own.items() if value):
             return run
@@ -79,18 +67,16 @@ def strip(notebook: nbformat.NotebookNode) -> None:
 
 def renew(config_path: str) -> None:
     """Renew every stored notebook from the runs of a profile."""
-    config = load_config(config_path)
+    config = chapters.load_config(config_path)
     for chapter in CHAPTERS:
         path = NOTEBOOKS / f"{chapter}.ipynb"
-        notebook = load_run(default_run(config, chapter).path(config["out_dir"]), path)
+        notebook = chapters.load_run(default_run(config, chapter).path(config["out_dir"]), path)
         drop_injected(notebook, path.name)
         strip(notebook)
-        notebook.metadata["rol"] = {"digest": stored_digest(notebook, config)}
+        notebook.metadata["rol"] = {"digest": chapters.stored_digest(notebook, config)}
         text = nbformat.writes(notebook)
-        if len(text.encode()) > LARGEST_MB * 1e6:
-            raise ChapterError(
-                f"{path}: {len(text.encode()) / 1e6:.2f} MB with its outputs; {LARGEST_MB} MB are allowed"
-            )
+        if (megabytes := len(text.encode()) / 1e6) > LARGEST_MB:
+            raise ChapterError(f"{path}: {megabytes:.2f} MB with its outputs; {LARGEST_MB} MB are allowed")
         write_text(path, text)
         print(f"renewed: {Path('notebooks', path.name)}")
 

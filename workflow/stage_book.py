@@ -20,19 +20,9 @@ from urllib.parse import urlsplit
 import nbformat
 import yaml
 
+import chapters
 import check
-from chapters import (
-    CHAPTERS,
-    NOTEBOOKS,
-    ROOT,
-    ChapterError,
-    Run,
-    all_runs,
-    book_pages,
-    load_config,
-    load_run,
-    tagged_cells,
-)
+from chapters import CHAPTERS, NOTEBOOKS, ROOT, ChapterError, Run, tagged_cells
 from rol.files import read_text, write_text
 from toolbox_pages import stage_toolbox
 
@@ -42,11 +32,21 @@ GLUED_KIND = "{glue:text}`kind`"
 # The picture of the first page is taken from a run: the first of these that there is, and what the page says of it.
 RESULT_FIGURES = (
     ("10_real_radar", "fig-story", "real.md"),
-    ("07_localization", "fig-trajectory", "virtual.md"),
+    ("07_localization", "fig-trajectory", "simulated.md"),
 )
 
 
 # ---- notebooks ------------------------------------------------------------------------------------------------
+
+
+def figure_of(cell: nbformat.NotebookNode) -> dict:
+    """Give the figure that the metadata of a cell describe, with its name and its caption; empty where it has none."""
+    return cell.metadata.get("mystnb", {}).get("figure", {})
+
+
+def first_text(notebook: nbformat.NotebookNode) -> nbformat.NotebookNode:
+    """Give the first text cell, which holds the title."""
+    return next(cell for cell in notebook.cells if cell.cell_type == "markdown")
 
 
 def fold_parameters(notebook: nbformat.NotebookNode) -> None:
@@ -54,10 +54,8 @@ def fold_parameters(notebook: nbformat.NotebookNode) -> None:
     for tag, words in (("parameters", "parameters"), ("injected-parameters", "parameters of this run")):
         for cell in tagged_cells(notebook, tag):
             cell.metadata["tags"] = [tag, "hide-input"]
-            cell.metadata["mystnb"] = {
-                "code_prompt_show": f"Show the {words}",
-                "code_prompt_hide": f"Hide the {words}",
-            }
+            show, hide = (f"{do} the {words}" for do in ("Show", "Hide"))
+            cell.metadata["mystnb"] = {"code_prompt_show": show, "code_prompt_hide": hide}
 
 
 def open_with_picture(notebook: nbformat.NotebookNode, images: Path, page: str, kind: str) -> None:
@@ -74,8 +72,7 @@ def open_with_picture(notebook: nbformat.NotebookNode, images: Path, page: str, 
         (images / f"opening-{page}.png").write_bytes(png)
         words = cell.metadata["opening"].replace("{kind}", kind.lower())
         label, alt = cell.metadata["mystnb"]["figure"]["name"], cell.metadata["mystnb"]["image"]["alt"]
-        first = next(cell for cell in notebook.cells if cell.cell_type == "markdown")
-        first.source += (
+        first_text(notebook).source += (
             f"\n\n```{{image}} ../images/opening-{page}.png\n:alt: {alt}\n:class: opening\n```\n\n"
             f"```{{container}} opening\n{words} ({{numref}}`{label}`).\n```"
         )
@@ -85,27 +82,24 @@ def open_with_picture(notebook: nbformat.NotebookNode, images: Path, page: str, 
 def number_title(notebook: nbformat.NotebookNode, page: str) -> None:
     """Put the chapter's number before the notebook's title, and what sets the page apart from its like behind (in place)."""
     chapter, _, more = page.partition("-")
-    cell = next(cell for cell in notebook.cells if cell.cell_type == "markdown")
+    cell = first_text(notebook)
     title = rf"# {int(chapter[:2])}. \1" + (f": {more}" if more else "")
     cell.source = re.sub(r"^# (.*)$", title, cell.source, count=1, flags=re.MULTILINE)
 
 
 def complete_captions(notebook: nbformat.NotebookNode, kind: str) -> None:
-    """Add to the captions of figures that show the sessions whether those are virtual or real (in place).
+    """Add to the captions of figures that show the sessions whether those are simulated or real (in place).
 
     The metadata of every figure's cell state in `data` what the figure shows. Only "session" depends on the profile;
     the captions of the others name their data themselves, as do those that glue in the `kind`.
     """
     for cell in notebook.cells:
-        figure = cell.metadata.get("mystnb", {}).get("figure", {})
+        figure, data = figure_of(cell), cell.metadata.get("data")
         if "caption" not in figure:
             continue
-        data = cell.metadata.get("data")
         if data not in FIGURE_DATA:
-            raise ChapterError(
-                f"figure {figure.get('name')}: `data` in the metadata of its cell is {data!r},"
-                f" none of {', '.join(FIGURE_DATA)}"
-            )
+            fault = f"`data` in the metadata of its cell is {data!r}, none of {', '.join(FIGURE_DATA)}"
+            raise ChapterError(f"figure {figure.get('name')}: {fault}")
         if data == "session" and GLUED_KIND not in figure["caption"]:
             figure["caption"] = f"{figure['caption'].strip()} {kind} data."
 
@@ -123,28 +117,22 @@ def relabel(notebook: nbformat.NotebookNode, suffix: str) -> None:
     those of the first.
     """
     text = [cell for cell in notebook.cells if cell.cell_type == "markdown"]
-    figures = [
-        cell.metadata.mystnb.figure
-        for cell in notebook.cells
-        if cell.metadata.get("mystnb", {}).get("figure")
-    ]
-    labels = {label for cell in text for match in DEFINED.findall(cell.source) for label in match if label}
+    figures = [figure_of(cell) for cell in notebook.cells if figure_of(cell)]
+    labels = {match[match.lastindex] for cell in text for match in DEFINED.finditer(cell.source)}
     labels |= {figure["name"] for figure in figures if "name" in figure}
 
     def renamed(match: re.Match) -> str:
         return match[1] + match[2] + (suffix if match[2] in labels else "")
 
     def redefined(match: re.Match) -> str:
-        label = next(group for group in match.groups() if group)
+        label = match[match.lastindex]
         return match[0].replace(label, label + suffix)
 
     for cell in text:
         cell.source = REFERRED.sub(renamed, DEFINED.sub(redefined, cell.source))
     for figure in figures:
-        if "name" in figure:
-            figure["name"] += suffix
-        if "caption" in figure:
-            figure["caption"] = REFERRED.sub(renamed, figure["caption"])
+        figure |= {"name": figure["name"] + suffix} if "name" in figure else {}
+        figure |= {"caption": REFERRED.sub(renamed, figure["caption"])} if "caption" in figure else {}
 
 
 def point_to_pages(text: str, pages: dict[str, Run]) -> str:
@@ -160,12 +148,12 @@ def point_to_pages(text: str, pages: dict[str, Run]) -> str:
 
 def stage_notebooks(config: dict, book: Path) -> None:
     """Copy the executed notebooks that the book shows; a run with a fault ends the staging."""
-    pages = book_pages(config)
+    pages = chapters.book_pages(config)
     seen: set[str] = set()
-    kind = "Virtual" if all(session.startswith("virtual-") for session in config["sessions"]) else "Real"
+    kind = "Simulated" if all(session.startswith("sim-") for session in config["sessions"]) else "Real"
     (book / "notebooks").mkdir()
     for page, run in pages.items():
-        notebook = load_run(run.path(config["out_dir"]), NOTEBOOKS / f"{run.chapter}.ipynb")
+        notebook = chapters.load_run(run.path(config["out_dir"]), NOTEBOOKS / f"{run.chapter}.ipynb")
         fold_parameters(notebook)
         complete_captions(notebook, kind)
         open_with_picture(notebook, book / "images", page, kind)
@@ -187,19 +175,12 @@ def png_of(cell: nbformat.NotebookNode) -> bytes | None:
     return None
 
 
-def read_figure(notebook: Path, name: str) -> bytes | None:
-    """Take the PNG of a named figure out of an executed notebook; none where the run drew none."""
-    for cell in nbformat.read(notebook, as_version=4).cells:
-        if cell.metadata.get("mystnb", {}).get("figure", {}).get("name") == name:
-            return png_of(cell)
-    return None
-
-
 def stage_result_figure(config: dict, book: Path) -> None:
-    """Write the picture of the first page, and the words below it: real data where they are at hand, else virtual."""
+    """Write the picture of the first page, and the words below it: of real data where a run shows them."""
     for chapter, name, words in RESULT_FIGURES:
-        run = next((run for run in book_pages(config).values() if run.chapter == chapter), None)
-        png = read_figure(run.path(config["out_dir"]), name) if run else None
+        run = next((run for run in chapters.book_pages(config).values() if run.chapter == chapter), None)
+        cells = chapters.read_notebook(run.path(config["out_dir"])).cells if run else []
+        png = next((png_of(cell) for cell in cells if figure_of(cell).get("name") == name), None)
         if png:
             (book / "images").mkdir(exist_ok=True)
             (book / "images" / "result.png").write_bytes(png)
@@ -211,18 +192,17 @@ def stage_result_figure(config: dict, book: Path) -> None:
 # ---- table of contents ----------------------------------------------------------------------------------------
 
 
-def expand_contents(contents: dict, pages: dict[str, Run], modules: list[str]) -> dict:
-    """Replace every chapter in the table of contents by its pages, and list the pages of the modules."""
+def expand_contents(contents: dict, pages: dict[str, Run], toolbox: list[dict]) -> dict:
+    """Replace every chapter in the table of contents by its pages, and add the entries of the toolbox."""
     for part in contents["parts"]:
         entries = []
         for entry in part["chapters"]:
             name = entry["file"].removeprefix("notebooks/")
             if name in CHAPTERS:
-                entries += [
-                    {"file": f"notebooks/{page}"} for page, run in pages.items() if run.chapter == name
-                ]
+                own = [page for page, run in pages.items() if run.chapter == name]
+                entries += [{"file": f"notebooks/{page}"} for page in own]
             elif entry["file"] == "toolbox/index":
-                entries.append(entry | {"sections": [{"file": f"toolbox/{module}"} for module in modules]})
+                entries.append(entry | {"sections": toolbox})
             else:
                 entries.append(entry)
         part["chapters"] = entries
@@ -253,19 +233,18 @@ def launch_settings(environment: Mapping[str, str]) -> dict:
     ChapterError
         If an address is not one that a browser can open.
     """
-    addresses = {
-        "ROL_REPOSITORY_URL": environment.get("ROL_REPOSITORY_URL", ""),
-        "ROL_BINDERHUB_URL": environment.get("ROL_BINDERHUB_URL", "") or "https://mybinder.org",
-    }
-    if not addresses["ROL_REPOSITORY_URL"]:
+    if not environment.get("ROL_REPOSITORY_URL"):
         return {}
-    for name, address in addresses.items():
+    addresses = []
+    for name, default in (("ROL_REPOSITORY_URL", ""), ("ROL_BINDERHUB_URL", "https://mybinder.org")):
+        address = environment.get(name) or default
         if urlsplit(address).scheme not in ("http", "https") or not urlsplit(address).netloc:
             raise ChapterError(f"{name}: not an address that begins with https:// ({address})")
-    repository, hub = (address.rstrip("/").removesuffix(".git") for address in addresses.values())
+        addresses.append(address.rstrip("/").removesuffix(".git"))
+    branch = environment.get("ROL_REPOSITORY_BRANCH") or "main"
     return {
-        "repository": {"url": repository, "branch": environment.get("ROL_REPOSITORY_BRANCH", "") or "main"},
-        "launch_buttons": {"notebook_interface": "jupyterlab", "binderhub_url": hub},
+        "repository": {"url": addresses[0], "branch": branch},
+        "launch_buttons": {"notebook_interface": "jupyterlab", "binderhub_url": addresses[1]},
     }
 
 
@@ -280,17 +259,18 @@ def stage_settings(book: Path, environment: Mapping[str, str]) -> None:
 # ---- generated pages ------------------------------------------------------------------------------------------
 
 
-def git(*words: str) -> str:
-    """Ask git, without minding when there is no repository."""
-    answer = subprocess.run(["git", *words], cwd=ROOT, capture_output=True, encoding="utf-8", check=False)
-    return answer.stdout.strip() if answer.returncode == 0 else ""
-
-
 def commit() -> str:
     """Name the commit of the working tree, where git knows it."""
-    known = git("rev-parse", "HEAD") or "not known (no git repository)"
-    changed = git("status", "--porcelain", "--untracked-files=no")
-    return known + (", with changes that are not committed" if changed else "")
+    words = [
+        "git",
+        "describe",
+        "--always",
+        "--abbrev=40",
+        "--exclude=*",
+        "--dirty=, with changes that are not committed",
+    ]
+    answer = subprocess.run(words, cwd=ROOT, capture_output=True, encoding="utf-8", check=False)
+    return answer.stdout.strip() if answer.returncode == 0 else "not known (no git repository)"
 
 
 def markdown_table(header: list[str], lines: list[list[str]]) -> str:
@@ -306,22 +286,17 @@ def reproduced_page(config: dict) -> str:
     made_on = check.read_reference(config["profile"])["machine"] if has_reference else {}
     tables = []
     for chapter in sorted({row.entry["chapter"] for row in rows}):
-        lines = [
-            [*row.cells(), f"{row.entry['kind']}: {row.entry['reason']}"]
-            for row in rows
-            if row.entry["chapter"] == chapter
-        ]
+        own = [row for row in rows if row.entry["chapter"] == chapter]
+        lines = [[*row.cells(), f"{row.entry['kind']}: {row.entry['reason']}"] for row in own]
         header = ["number", "reference", "this build", "tolerance", "result", "depends on"]
         title = f"### [Chapter {int(chapter[:2])}](notebooks/{chapter}.ipynb)"
         tables.append(f"{title}\n\n{markdown_table(header, lines)}")
     counts = [[result, str(n)] for result, n in [*check.count_results(rows).items(), ("all", len(rows))]]
-    here = check.machine() | {"Commit": commit()}
+    machines = [[k, made_on.get(k, ""), v] for k, v in (check.machine() | {"Commit": commit()}).items()]
     parts = {
         "counts": markdown_table(["result", "numbers"], counts),
         "numbers": "\n\n".join(tables),
-        "machine": markdown_table(
-            ["what", "reference", "this build"], [[k, made_on.get(k, ""), v] for k, v in here.items()]
-        ),
+        "machine": markdown_table(["what", "reference", "this build"], machines),
     }
     text = read_text(check.PAGE)
     for name, part in parts.items():
@@ -331,26 +306,21 @@ def reproduced_page(config: dict) -> str:
 
 def how_made_page(config: dict, config_path: str) -> str:
     """Write the page that says when, from what, with what and in what time the book was made."""
-    rows = [
-        ["Made", datetime.datetime.now(datetime.UTC).strftime("%Y-%m-%d %H:%M UTC")],
-        ["Commit", commit()],
-        ["Profile", f"`{config_path}`"],
-        *([name, value] for name, value in check.machine().items()),
-    ]
-    times = [
-        [run.chapter, run.session, run.method, f"{metadata.papermill.duration:.0f}"]
-        for run in all_runs(config)
-        for metadata in [nbformat.read(run.path(config["out_dir"]), as_version=4).metadata]
-    ]
+    made = datetime.datetime.now(datetime.UTC).strftime("%Y-%m-%d %H:%M UTC")
+    rows = {"Made": made, "Commit": commit(), "Profile": f"`{config_path}`", **check.machine()}
+    times = []
+    for run in chapters.all_runs(config):
+        seconds = chapters.read_notebook(run.path(config["out_dir"])).metadata.papermill.duration
+        times.append([run.chapter, run.session, run.method, f"{seconds:.0f}"])
     parts = [
         MADE_TITLE,
-        markdown_table(["what", "this build"], rows),
+        markdown_table(["what", "this build"], [list(row) for row in rows.items()]),
         "## Time that each chapter took",
         markdown_table(["chapter", "session", "method", "s"], times),
         "## The profile",
-        f"```yaml\n{read_text(config_path).strip()}\n```",
+        f"```yaml\n{read_text(config_path).strip()}\n```\n",
     ]
-    return "\n\n".join(parts) + "\n"
+    return "\n\n".join(parts)
 
 
 def clear(book: Path) -> None:
@@ -358,9 +328,7 @@ def clear(book: Path) -> None:
     made = book / "made.md"
     is_staged = made.is_file() and made.read_bytes().startswith((MADE_TITLE.encode(), STAGING.encode()))
     if not is_staged and any(path.is_file() or path.is_symlink() for path in book.rglob("*")):
-        raise ChapterError(
-            f"book_dir: {book}: holds files but no made.md of this program, so it is no staged book; left alone"
-        )
+        raise ChapterError(f"book_dir: {book}: holds files but no made.md of this program; left alone")
     if book.is_symlink():
         raise ChapterError(f"book_dir: {book}: a symbolic link; name the folder itself")
     shutil.rmtree(book, ignore_errors=True)
@@ -369,29 +337,29 @@ def clear(book: Path) -> None:
 
 def stage(config_path: str) -> Path:
     """Stage the whole book of a profile and give its folder."""
-    config = load_config(config_path)
+    config = chapters.load_config(config_path)
     book = Path(config["book_dir"])
     clear(book)
     shutil.copytree(ROOT / "book", book, ignore=shutil.ignore_patterns("._*"), dirs_exist_ok=True)
     stage_notebooks(config, book)
     stage_result_figure(config, book)
-    modules = stage_toolbox(book)
+    toolbox = stage_toolbox(book)
     write_text(book / "made.md", how_made_page(config, config_path))
     write_text(book / "did_it_reproduce.md", reproduced_page(config))
-    pages = book_pages(config)
+    pages = chapters.book_pages(config)
     for page in book.glob("*.md"):
         write_text(page, point_to_pages(read_text(page), pages))
-    contents = expand_contents(yaml.safe_load(read_text(book / "_toc.yml")), pages, modules)
+    contents = expand_contents(yaml.safe_load(read_text(book / "_toc.yml")), pages, toolbox)
     write_text(book / "_toc.yml", yaml.safe_dump(contents, sort_keys=False))
     stage_settings(book, os.environ)
     return book
 
 
 if __name__ == "__main__":
-    if sys.argv[1] == "--where":
-        print(Path(load_config(sys.argv[2])["book_dir"], "_build", "html", "index.html"))
-    else:
-        try:
+    try:
+        if sys.argv[1] == "--where":
+            print(Path(chapters.load_config(sys.argv[2])["book_dir"], "_build", "html", "index.html"))
+        else:
             print(f"staged: {stage(sys.argv[1])}")
-        except ChapterError as error:
-            sys.exit(f"ERROR: {error}")
+    except ChapterError as error:
+        sys.exit(f"ERROR: {error}")

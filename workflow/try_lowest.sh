@@ -5,7 +5,7 @@ set -euo pipefail
 cd "$(dirname "$0")/.."
 env=build/lowest
 # These need what neither extra brings: the workflow, the simulator's Open3D, or packages for tests alone.
-others='test_(copy_alone|examples|end_to_end|measure_route|profiles|progress|project|set_up|stage_book|train_weights|virtual_.*)\.py$'
+others='test_(copy_alone|examples|end_to_end|route_tables|profiles|progress|project|set_up|stage_book|shipped_networks|simulated_.*|sampled_points|rendered_points|two_sample_classifier)\.py$'
 
 .venv/bin/python -m venv --clear $env
 .venv/bin/uv pip install --quiet --python $env/bin/python --torch-backend=auto --resolution lowest-direct -e ".[translator]" 2>/dev/null ||

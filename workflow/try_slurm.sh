@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
 # Run a part of the tiny profile through a Slurm of one node, started for this run only, with the cluster profile.
 #
-#   workflow/try_slurm.sh             the virtual sessions and chapters 1 to 3 of config/smoke.yaml, 16 jobs
+#   workflow/try_slurm.sh             the simulated sessions and chapters 1 to 3 of config/smoke.yaml, 16 jobs
 #   workflow/try_slurm.sh book        all chapters and the book
 #
 # Needs `make setup`, and Slurm: on Debian and Ubuntu, as root, it installs slurm-wlm and munge by itself; elsewhere install

@@ -63,9 +63,17 @@ def clean_pages(app: Sphinx, exception: Exception | None) -> None:
             page.write_text(after)
 
 
+def readable_defaults(
+    app: Sphinx, what: str, name: str, obj: object, options: dict, arguments: str, returns: str
+) -> tuple:
+    """Give a signature in which a default that is made anew each time is `...`, which Sphinx can parse."""
+    return arguments and arguments.replace("<factory>", "..."), returns
+
+
 def setup(app: Sphinx) -> dict:
     """Tell Sphinx when to call what."""
     app.connect("html-page-context", leave_out_scripts, priority=900)
     app.connect("html-page-context", point_to_stored, priority=901)
+    app.connect("autodoc-process-signature", readable_defaults)
     app.connect("build-finished", clean_pages)
     return {"version": "1", "parallel_read_safe": True, "parallel_write_safe": True}

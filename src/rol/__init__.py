@@ -1,3 +1,3 @@
-"""Radar-on-lidar: the reusable functions of the book, one topic per file."""
+"""Radar-on-lidar: the method of the paper, one module per step."""
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"

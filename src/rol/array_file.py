@@ -1,4 +1,4 @@
-"""Arrays in a temporary file: a sequence as long as a drive without its memory."""
+"""Keep a long sequence of arrays in a temporary file instead of memory."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ import numpy as np
 
 
 class ArrayFile(Sequence):
-    """A sequence of arrays that lie in a temporary file; the file goes with the sequence, however the process ends.
+    """A sequence of arrays in a temporary file, which is removed with the sequence, however the process ends.
 
     Parameters
     ----------
     folder : path
-        Where the file lies; made if absent.
+        Folder of the file; made if absent.
     arrays : iterable of array
-        Arrays of any shapes and plain dtypes, taken one by one.
+        Arrays of any shapes and plain dtypes, consumed one by one.
 
     Raises
     ------

@@ -1,14 +1,20 @@
-"""The bird's-eye room: points to image and back (Eq. 1).
+"""Convert points to bird's-eye-view images and back (Eq. 1), and grey values to the range of the networks.
 
 Row 0 is farthest forward (x), column 0 farthest left (y), index is (row, column), the sensor sits in the
 middle between the four central pixels, and a pixel's coordinate is that of its centre: ``x = ((width - 1) / 2
-- row) * pixel_size`` and ``y = ((width - 1) / 2 - column) * pixel_size``. A pixel takes part when its centre
+- row) * pixel_size`` and ``y = ((width - 1) / 2 - column) * pixel_size``. A pixel is used when its centre
 lies within ``max_range``; the same rule in both directions makes the round trips exact.
 """
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
+
+try:
+    from .geometry import check_points
+except ImportError:  # this file was copied on its own
+    from geometry import check_points
 
 
 def points_to_image(
@@ -41,13 +47,7 @@ def points_to_image(
     -----
     Yin et al. 2020, Eq. 1.
     """
-    points = np.asarray(points, dtype=np.float64)
-    if points.ndim != 2 or points.shape[1] < 2:
-        raise ValueError(f"points: expected shape (n, 2) or more columns, got {points.shape}")
-    if not np.isfinite(points[:, :2]).all():
-        raise ValueError(
-            f"points: point {int(np.argmin(np.isfinite(points[:, :2]).all(axis=1)))} is not finite"
-        )
+    points = check_points(points, more=True)
     cells = np.floor(width / 2.0 - points[:, :2] / pixel_size)
     cells = cells[((cells >= 0) & (cells < width)).all(axis=1)].astype(np.int64)
     centres = ((width - 1) / 2.0 - cells) * pixel_size
@@ -66,7 +66,7 @@ def image_to_points(
     min_range: float = 0.0,
     thin: bool = False,
 ) -> np.ndarray:
-    """Read an occupancy image as points.
+    """Convert an occupancy image into points.
 
     Parameters
     ----------
@@ -79,7 +79,7 @@ def image_to_points(
     max_range, min_range : float
         Pixels whose centre is farther from the sensor, or nearer, are left out [m].
     thin : bool
-        Keep only the crest of every stroke, see `crest_pixels`; the paper keeps all.
+        Keep only the crests, see `crest_pixels`; the paper keeps all pixels.
 
     Returns
     -------
@@ -106,7 +106,7 @@ def image_to_points(
 
 
 def crest_pixels(image: np.ndarray, sigma: float = 0.8) -> np.ndarray:
-    """Mark the pixels that lie on the crest of a stroke: largest across it, after a little smoothing.
+    """Mark the pixels that are local maxima across a line of the smoothed image.
 
     Parameters
     ----------
@@ -123,11 +123,9 @@ def crest_pixels(image: np.ndarray, sigma: float = 0.8) -> np.ndarray:
 
     Notes
     -----
-    The suppression of non-maxima that Canny's edge detector does. A translator that is unsure by a pixel draws
-    strokes of three; their middle is where the wall is. Not in the paper.
+    Non-maximum suppression as in Canny's edge detector. A generator that is uncertain by a pixel draws lines three
+    pixels wide; the wall is in the middle. Not in the paper.
     """
-    import cv2
-
     smooth = cv2.GaussianBlur(np.asarray(image, dtype=np.float32), (0, 0), sigma)
     padded = np.pad(smooth, 1, mode="edge")
     (h, w), curved = smooth.shape, np.full(smooth.shape, np.inf, dtype=np.float32)
@@ -140,3 +138,8 @@ def crest_pixels(image: np.ndarray, sigma: float = 0.8) -> np.ndarray:
         curved[is_sharpest] = bend[is_sharpest]
         is_crest[is_sharpest] = ((smooth >= after) & (smooth > before))[is_sharpest]
     return is_crest
+
+
+def normalize_image(image: np.ndarray) -> np.ndarray:
+    """Scale grey values 0..255 to [-1, 1], the input of the networks, as float32 of the same shape."""
+    return image.astype(np.float32) / np.float32(127.5) - np.float32(1.0)

@@ -1,4 +1,4 @@
-"""Compile functions with numba and cache the result on disk where that is possible.
+"""Compile functions with numba, cached on disk if possible.
 
 With numba's own ``cache=True`` a module cannot be imported where no folder for the cache can be written (no
 writable home, code from a string), and a cache file that is empty or cut off raises at every call.
@@ -22,7 +22,7 @@ def compiled(function: Callable | None = None, **options: Any) -> Callable:
     function : callable, optional
         The function; absent when the decorator is called with options.
     **options
-        Options of ``numba.njit``, such as ``parallel=True``.
+        Options of ``numba.njit``, such as ``nogil=True``.
 
     Returns
     -------
@@ -38,7 +38,7 @@ def compiled(function: Callable | None = None, **options: Any) -> Callable:
 
 
 class _TolerantCache(FunctionCache):
-    """numba's cache, but unreadable files are replaced and files that cannot be written are left out."""
+    """numba's cache, except that unreadable files are replaced and files that cannot be written are skipped."""
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         with contextlib.suppress(Exception):  # damaged pickles raise almost any exception

@@ -1,8 +1,8 @@
-"""Judging a localization run: errors, classes, failures, and the files that hold them.
+"""Evaluation of a localization run: errors, classes, failures, and their files.
 
-The measures of the paper's Tables II and III (Sec. IV-C): root mean square errors of position and heading,
-the shares of scans within three pairs of limits, and failures, for which the paper gives no rule and this
-file one with parameters. Trajectories are written in the TUM format, which ``evo`` reads.
+The measures of the paper's Tables II and III (Sec. IV-C): root mean square errors of position and heading, the fractions of
+scans within three pairs of limits, and failures. The paper states no rule for failures; `FailureRule` is one with
+parameters. Trajectories are written in the TUM format, which ``evo`` reads.
 """
 
 from __future__ import annotations
@@ -15,18 +15,17 @@ import numpy as np
 
 try:
     from .files import read_text, write_text
-    from .geometry import check_fields, check_poses, relative_pose, wrap_angle
-except ImportError:  # this file was copied on its own
+    from .geometry import check_fields, check_poses, relative_pose
+except ImportError:  # this file was copied into a folder that is no package
     from files import read_text, write_text
-    from geometry import check_fields, check_poses, relative_pose, wrap_angle
+    from geometry import check_fields, check_poses, relative_pose
 
 CLASSES = ((1.0, 2.0), (2.0, 5.0), (5.0, 10.0))  # limits of Table III: position [m], heading [deg]
-KITTI_LENGTHS_M = tuple(100.0 * k for k in range(1, 9))  # stretches of the KITTI odometry benchmark [m]
-NEES_95 = 7.814727903251179  # 95 % of a chi-square distribution of three degrees of freedom lie below
+KITTI_LENGTHS_M = tuple(100.0 * k for k in range(1, 9))  # segments of the KITTI odometry benchmark [m]
 
 
 class EvaluationError(ValueError):
-    """Raised for trajectories and files that cannot be judged; names the file and the fault."""
+    """Raised for trajectories and files that cannot be evaluated; names the file and the fault."""
 
 
 @dataclass(frozen=True)
@@ -36,9 +35,9 @@ class PoseErrors:
     Attributes
     ----------
     position_m : array, shape (n,)
-        Distance between estimate and truth [m].
+        Distance between estimate and ground truth [m].
     longitudinal_m, lateral_m : array, shape (n,)
-        Estimate ahead of (+) or behind the truth, and left (+) or right of it, in the true radar frame [m].
+        Error ahead (+) or behind, and to the left (+) or right, in the true radar frame [m].
     yaw_rad : array, shape (n,)
         Estimated minus true heading in [-pi, pi) [rad].
     """
@@ -50,7 +49,7 @@ class PoseErrors:
 
 
 def pose_errors(estimate: np.ndarray, truth: np.ndarray) -> PoseErrors:
-    """Compare estimated with true poses, scan by scan.
+    """Compute the errors of estimated poses, scan by scan.
 
     Parameters
     ----------
@@ -66,13 +65,13 @@ def pose_errors(estimate: np.ndarray, truth: np.ndarray) -> PoseErrors:
     EvaluationError
         If the lengths differ or there is no pose.
     """
-    estimate, truth = _check_pair(estimate, truth)
+    estimate, truth = check_pair(estimate, truth)
     ahead, left, turned = relative_pose(truth, estimate).T
     return PoseErrors(np.hypot(ahead, left), ahead, left, turned)
 
 
 def rmse(values: np.ndarray) -> float:
-    """Give the root mean square of errors.
+    """Compute the root mean square of errors.
 
     Parameters
     ----------
@@ -87,8 +86,8 @@ def rmse(values: np.ndarray) -> float:
     return float(np.sqrt(np.mean(np.square(values))))
 
 
-def share_within(errors: PoseErrors, max_position_m: float, max_yaw_deg: float) -> float:
-    """Give the share of scans within both limits.
+def fraction_within(errors: PoseErrors, max_position_m: float, max_yaw_deg: float) -> float:
+    """Compute the fraction of scans within both limits.
 
     Parameters
     ----------
@@ -99,7 +98,7 @@ def share_within(errors: PoseErrors, max_position_m: float, max_yaw_deg: float) 
 
     Returns
     -------
-    share : float
+    fraction : float
         Between 0 and 1. Yin et al. 2020, Table III.
     """
     inside = (errors.position_m < max_position_m) & (np.abs(np.rad2deg(errors.yaw_rad)) < max_yaw_deg)
@@ -108,20 +107,20 @@ def share_within(errors: PoseErrors, max_position_m: float, max_yaw_deg: float) 
 
 @dataclass(frozen=True)
 class FailureRule:
-    """When a run counts as failed: too far off for too long.
+    """Rule of a failure: an error above a limit for a time without a break.
 
-    The paper counts failures without saying what one is. Beyond 20 m another street's walls lie nearer than
-    the right ones, and with the heading 45 deg off no street fits, so a filter comes back only by luck; a
-    shorter excursion may be a passing lorry, hence the five seconds.
+    The paper counts failures without a definition. Beyond 20 m the walls of another street are closer than the correct
+    ones, and with a heading error of 45 deg no street matches, so a filter recovers only by chance. A shorter excursion may
+    be caused by a passing lorry, hence the five seconds.
 
     Attributes
     ----------
     max_position_m : float
-        Position error above which a scan is off [m].
+        Largest position error [m].
     max_yaw_rad : float
-        Heading error above which a scan is off [rad].
+        Largest heading error [rad].
     seconds : float
-        Time over which every scan must be off [s].
+        Time over which every scan must be beyond a limit [s].
 
     Raises
     ------
@@ -130,7 +129,7 @@ class FailureRule:
     """
 
     max_position_m: float = 20.0
-    max_yaw_rad: float = np.deg2rad(45.0)
+    max_yaw_rad: float = float(np.deg2rad(45.0))
     seconds: float = 5.0
 
     def __post_init__(self) -> None:
@@ -139,42 +138,42 @@ class FailureRule:
 
 
 @dataclass
-class FailureWatch:
-    """Watch a run with the truth at hand; on a failure, note the scan and give the true pose to restart from.
+class FailureMonitor:
+    """Monitor of a run with ground truth: records failures and returns the true pose to reset to.
 
-    To be passed to `rol.mcl.localize` as its supervisor: the person who, in the paper, set the state by hand.
+    A ``reset_callback`` of `rol.mcl.localize`; it replaces the manual resets of the paper.
 
     Attributes
     ----------
     stamps_us : array, shape (n,)
         Times of the scans [us].
     truth : array, shape (n, 3)
-        True poses T_map_radar [m, m, rad].
+        Ground-truth poses T_map_radar [m, m, rad].
     rule : FailureRule
-        What counts as a failure.
+        Rule of a failure.
     failures : list of int
-        Scans after which the run was restarted, filled while watching.
+        Scans after which the run was reset.
     """
 
     stamps_us: np.ndarray
     truth: np.ndarray
     rule: FailureRule = FailureRule()
     failures: list[int] = field(default_factory=list)
-    off_since_us: int | None = None
+    beyond_since_us: int | None = None
 
     def __call__(self, index: int, pose: np.ndarray) -> np.ndarray | None:
-        """Judge one estimate; give the true pose if the run has just failed, else None."""
+        """Check one estimate; return the true pose if the run has just failed, else None."""
         ahead, left, turned = relative_pose(self.truth[index], pose)
         if np.hypot(ahead, left) <= self.rule.max_position_m and abs(turned) <= self.rule.max_yaw_rad:
-            self.off_since_us = None
+            self.beyond_since_us = None
             return None
         stamp_us = int(self.stamps_us[index])
-        if self.off_since_us is None:
-            self.off_since_us = stamp_us
-        if stamp_us - self.off_since_us < self.rule.seconds * 1e6:
+        if self.beyond_since_us is None:
+            self.beyond_since_us = stamp_us
+        if stamp_us - self.beyond_since_us < self.rule.seconds * 1e6:
             return None
         self.failures.append(index)
-        self.off_since_us = None
+        self.beyond_since_us = None
         return self.truth[index]
 
 
@@ -188,7 +187,7 @@ def summarize(
     update_ms_median: float,
     seed: int,
 ) -> dict[str, str | int | float]:
-    """Gather the figures of one run.
+    """Compute the metrics of one run.
 
     Parameters
     ----------
@@ -197,7 +196,7 @@ def summarize(
     method, session : str
         Names.
     failures : int
-        Restarts.
+        Number of failures.
     update_ms_median : float
         Median time of a filter update [ms].
     seed : int
@@ -206,10 +205,10 @@ def summarize(
     Returns
     -------
     metrics : dict
-        The keys that `write_metrics` wants; shares between 0 and 1. Yin et al. 2020, Tables II and III.
+        The keys of ``METRICS``; fractions between 0 and 1. Yin et al. 2020, Tables II and III.
     """
     errors = pose_errors(estimate, truth)
-    shares = {f"within_{m:.0f}m_{deg:.0f}deg": share_within(errors, m, deg) for m, deg in CLASSES}
+    fractions = {f"within_{m:.0f}m_{deg:.0f}deg": fraction_within(errors, m, deg) for m, deg in CLASSES}
     return {
         "method": method,
         "session": session,
@@ -217,104 +216,32 @@ def summarize(
         "failures": int(failures),
         "rmse_m": rmse(errors.position_m),
         "rmse_yaw_deg": rmse(np.rad2deg(errors.yaw_rad)),
-        **shares,
+        **fractions,
         "update_ms_median": float(update_ms_median),
         "seed": int(seed),
     }
 
 
-def error_figures(errors: PoseErrors) -> dict[str, float]:
-    """Give figures of a run beyond those of the paper: medians, and the errors along and across the way.
-
-    Parameters
-    ----------
-    errors : PoseErrors
-        From `pose_errors`.
-
-    Returns
-    -------
-    figures : dict
-        ``median_m`` and ``median_yaw_deg`` of the absolute errors, ``rmse_longitudinal_m`` and
-        ``rmse_lateral_m`` in the true radar frame. Not part of ``metrics.json``.
-    """
-    return {
-        "median_m": float(np.median(errors.position_m)),
-        "median_yaw_deg": float(np.median(np.abs(np.rad2deg(errors.yaw_rad)))),
-        "rmse_longitudinal_m": rmse(errors.longitudinal_m),
-        "rmse_lateral_m": rmse(errors.lateral_m),
-    }
-
-
-def pose_nees(estimate: np.ndarray, truth: np.ndarray, covariances: np.ndarray) -> np.ndarray:
-    """Give the normalized estimation error squared of poses: how large an error is beside its own covariance.
-
-    Parameters
-    ----------
-    estimate, truth : array, shape (n, 3)
-        Poses T_map_radar [m, m, rad].
-    covariances : array, shape (n, 3, 3)
-        Covariances of (x, y, yaw) in the map frame, of each estimate [m, m, rad].
-
-    Returns
-    -------
-    nees : array, shape (n,)
-        e' C^-1 e with e = estimate - truth, its heading in [-pi, pi). Mean 3 where covariances are honest.
-
-    Raises
-    ------
-    EvaluationError
-        If lengths differ, or a covariance is not finite, symmetric and positive definite; names its index.
-    """
-    estimate, truth = _check_pair(estimate, truth)
-    covariances = _check_covariances(covariances, len(estimate))
-    errors = estimate - truth
-    errors[:, 2] = wrap_angle(errors[:, 2])
-    return np.einsum("ni,ni->n", errors, np.linalg.solve(covariances, errors[..., None])[..., 0])
-
-
-def consistency(estimate: np.ndarray, truth: np.ndarray, covariances: np.ndarray) -> dict[str, float]:
-    """Judge whether covariances tell the errors: an honest filter has a mean NEES of 3 and 95 % within the bound.
-
-    Parameters
-    ----------
-    estimate, truth, covariances
-        As in `pose_nees`.
-
-    Returns
-    -------
-    figures : dict
-        ``mean_nees``, above 3 for a filter too sure of itself, and ``within_95``, the share of poses whose NEES lies
-        below ``NEES_95`` (0..1).
-
-    Raises
-    ------
-    EvaluationError
-        As in `pose_nees`.
-    """
-    nees = pose_nees(estimate, truth, covariances)
-    return {"mean_nees": float(np.mean(nees)), "within_95": float(np.mean(nees <= NEES_95))}
-
-
 @dataclass(frozen=True)
 class DriftReport:
-    """Drift of odometry over stretches of several lengths.
+    """Drift of odometry over segments of several lengths.
 
     Attributes
     ----------
     lengths_m : array, shape (k,)
-        Lengths for which the way is long enough, of those asked for [m].
-    n_stretches : array of int, shape (k,)
-        Stretches of each.
+        Lengths, of those requested, for which the path is long enough [m].
+    n_segments : array of int, shape (k,)
+        Segments of each.
     translation_pct : array, shape (k,)
-        Mean position error at their end, in per cent of their length.
+        Mean position error at their end, as a percentage of their length.
     rotation_deg_per_100m : array, shape (k,)
-        Mean heading error at their end, without its sign [deg per 100 m].
+        Mean absolute heading error at their end [deg per 100 m].
     mean_translation_pct, mean_rotation_deg_per_100m : float
-        Means over all stretches of all lengths, the benchmark's two numbers; NaN without a stretch.
+        Means over all segments of all lengths, the benchmark's two numbers; NaN without a segment.
     """
 
     lengths_m: np.ndarray
-    n_stretches: np.ndarray
+    n_segments: np.ndarray
     translation_pct: np.ndarray
     rotation_deg_per_100m: np.ndarray
     mean_translation_pct: float
@@ -324,67 +251,43 @@ class DriftReport:
 def drift_by_length(
     estimate: np.ndarray, truth: np.ndarray, lengths_m: tuple[float, ...] = KITTI_LENGTHS_M
 ) -> DriftReport:
-    """Measure the drift of odometry in the full form of the KITTI benchmark.
+    """Compute the drift of odometry as the KITTI benchmark does.
 
     Parameters
     ----------
     estimate, truth : array, shape (n, 3)
         Poses in any two frames [m, m, rad].
     lengths_m : tuple of float
-        Lengths of the stretches along the true way [m]; one starts at every tenth pose and ends at the first pose so
-        far on. Those that the way is too short for are left out.
+        Lengths of the segments along the true path [m]; one starts at every tenth pose and ends at the first pose at this
+        distance. Lengths that exceed the path are left out.
 
     Returns
     -------
     report : DriftReport
-        Which lengths remain, and the errors of each.
+        Lengths and the errors of each.
 
     Raises
     ------
     EvaluationError
         If the lengths differ or there is no pose.
     """
-    estimate, truth = _check_pair(estimate, truth)
-    errors = [_stretch_errors(estimate, truth, length) for length in lengths_m]
+    estimate, truth = check_pair(estimate, truth)
+    errors = [_segment_errors(estimate, truth, length) for length in lengths_m]
     is_kept = np.array([len(error) > 0 for error in errors], dtype=bool)
     kept = [error for error in errors if len(error)]
     means = np.array([error.mean(axis=0) for error in kept]).reshape(-1, 2)
     overall = np.concatenate(kept).mean(axis=0) if kept else np.full(2, np.nan)
-    n_stretches = np.array([len(error) for error in kept], dtype=int)
-    return DriftReport(np.array(lengths_m)[is_kept], n_stretches, *means.T, *map(float, overall))
-
-
-def drift(estimate: np.ndarray, truth: np.ndarray, lengths_m: tuple[float, ...] = (100.0, 200.0)) -> float:
-    """Give the drift of odometry as one number, see `drift_by_length`.
-
-    Parameters
-    ----------
-    estimate, truth : array, shape (n, 3)
-        Poses in any two frames [m, m, rad].
-    lengths_m : tuple of float
-        Lengths of the stretches along the true way [m]; one starts at every tenth pose.
-
-    Returns
-    -------
-    drift : float
-        Mean over stretches of the end's position error over the stretch's length; NaN if the way is too
-        short.
-
-    Raises
-    ------
-    EvaluationError
-        If the lengths differ or there is no pose.
-    """
-    return drift_by_length(estimate, truth, lengths_m).mean_translation_pct / 100.0
+    n_segments = np.array([len(error) for error in kept], dtype=int)
+    return DriftReport(np.array(lengths_m)[is_kept], n_segments, *means.T, *map(float, overall))
 
 
 def write_tum(path: Path | str, stamps_us: np.ndarray, poses: np.ndarray) -> None:
-    """Write a trajectory in the TUM format: time [s], x y z [m], quaternion x y z w, z and the tilt zero.
+    """Write a trajectory in the TUM format: time [s], x y z [m], quaternion x y z w; z and tilt are zero.
 
     Parameters
     ----------
     path : Path or str
-        File to write; it appears whole or not at all.
+        File to write, atomically.
     stamps_us : array of int, shape (n,)
         Increasing times [us].
     poses : array, shape (n, 3)
@@ -410,14 +313,14 @@ def read_tum(path: Path | str) -> tuple[np.ndarray, np.ndarray]:
     Parameters
     ----------
     path : Path or str
-        File to read; lines that begin with # are skipped.
+        File to read; lines that start with # are skipped.
 
     Returns
     -------
     stamps_us : array of int64, shape (n,)
         Times [us].
     poses : array, shape (n, 3)
-        Poses (x, y, yaw) [m, m, rad]; height and tilt are left out.
+        Poses (x, y, yaw) [m, m, rad]; height and tilt are ignored.
 
     Raises
     ------
@@ -441,7 +344,7 @@ def read_tum(path: Path | str) -> tuple[np.ndarray, np.ndarray]:
     poses = np.stack([table[:, 1], table[:, 2], 2.0 * np.arctan2(table[:, 6], table[:, 7])], axis=1)
     poses[:, 2] = (poses[:, 2] + np.pi) % (2.0 * np.pi) - np.pi
     _check_trajectory(path, table[:, 0], poses)
-    if np.abs(table[:, 0]).max() > 1e11:  # 3000 years; today's time in ms is above that
+    if np.abs(table[:, 0]).max() > 1e11:  # 3000 years; times in ms are above that
         raise EvaluationError(f"{path}: time {table[:, 0].max():.0f} cannot be in seconds")
     stamps_us = np.round(table[:, 0] * 1e6).astype(np.int64)
     _check_trajectory(path, stamps_us, poses)
@@ -449,19 +352,27 @@ def read_tum(path: Path | str) -> tuple[np.ndarray, np.ndarray]:
 
 
 METRICS = {
-    "method": str, "session": str, "n_scans": int, "failures": int, "rmse_m": float, "rmse_yaw_deg": float,
-    "within_1m_2deg": float, "within_2m_5deg": float, "within_5m_10deg": float, "update_ms_median": float,
+    "method": str,
+    "session": str,
+    "n_scans": int,
+    "failures": int,
+    "rmse_m": float,
+    "rmse_yaw_deg": float,
+    "within_1m_2deg": float,
+    "within_2m_5deg": float,
+    "within_5m_10deg": float,
+    "update_ms_median": float,
     "seed": int,
-}  # fmt: skip
+}
 
 
 def write_metrics(path: Path | str, metrics: dict[str, str | int | float]) -> None:
-    """Write the figures of one run as json.
+    """Write the metrics of one run as JSON.
 
     Parameters
     ----------
     path : Path or str
-        File to write; it appears whole or not at all.
+        File to write, atomically.
     metrics : dict
         From `summarize`: exactly the keys of ``METRICS``.
 
@@ -475,7 +386,7 @@ def write_metrics(path: Path | str, metrics: dict[str, str | int | float]) -> No
 
 
 def read_metrics(path: Path | str) -> dict[str, str | int | float]:
-    """Read the figures of one run.
+    """Read the metrics of one run.
 
     Parameters
     ----------
@@ -490,7 +401,7 @@ def read_metrics(path: Path | str) -> dict[str, str | int | float]:
     Raises
     ------
     EvaluationError
-        If the file is no json, or its keys or values are not those of a run.
+        If the file is no JSON, or its keys or values are not those of a run.
     """
     try:
         metrics = json.loads(read_text(path))
@@ -500,37 +411,20 @@ def read_metrics(path: Path | str) -> dict[str, str | int | float]:
     return metrics
 
 
-def _check_pair(estimate: np.ndarray, truth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Check that there are poses, and as many estimated as true ones."""
+def check_pair(estimate: np.ndarray, truth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Check that the numbers of estimated and true poses, shape (n, 3), are equal and above zero."""
     estimate, truth = check_poses(estimate, "estimate"), check_poses(truth, "truth")
     if estimate.shape != truth.shape or len(estimate) == 0:
         raise EvaluationError(f"{len(estimate)} estimated poses for {len(truth)} true ones")
     return estimate, truth
 
 
-def _check_covariances(covariances: np.ndarray, n: int) -> np.ndarray:
-    """Check that there are n covariances, finite, symmetric and positive definite."""
-    covariances = np.asarray(covariances, dtype=np.float64)
-    if covariances.shape != (n, 3, 3):
-        raise EvaluationError(f"covariances: expected shape ({n}, 3, 3), got {covariances.shape}")
-    checks = {
-        "finite": lambda c: np.isfinite(c).all(axis=(1, 2)),
-        "symmetric": lambda c: np.isclose(c, c.transpose(0, 2, 1), rtol=1e-6, atol=1e-12).all(axis=(1, 2)),
-        "positive definite": lambda c: np.linalg.eigvalsh(c) @ (1.0, 0.0, -1e-15) > 0.0,  # beyond rounding
-    }
-    for quality, check in checks.items():
-        is_good = check(covariances)
-        if not is_good.all():
-            raise EvaluationError(f"covariances: matrix at index {int(np.argmin(is_good))} is not {quality}")
-    return covariances
-
-
-def _stretch_errors(estimate: np.ndarray, truth: np.ndarray, length_m: float) -> np.ndarray:
-    """Errors at the end of stretches of one length, shape (n, 2): position [%], heading [deg per 100 m]."""
-    way = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(truth[:, :2], axis=0).T))])
-    first = np.arange(0, len(way), 10)
-    last = np.searchsorted(way, way[first] + length_m)
-    first, last = first[last < len(way)], last[last < len(way)]
+def _segment_errors(estimate: np.ndarray, truth: np.ndarray, length_m: float) -> np.ndarray:
+    """Compute the errors at the end of segments of one length, shape (n, 2): position [%], heading [deg per 100 m]."""
+    path_m = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(truth[:, :2], axis=0).T))])
+    first = np.arange(0, len(path_m), 10)
+    last = np.searchsorted(path_m, path_m[first] + length_m)
+    first, last = first[last < len(path_m)], last[last < len(path_m)]
     ends = (relative_pose(poses[first], poses[last]) for poses in (truth, estimate))
     x, y, yaw = relative_pose(*ends).T
     return np.stack([np.hypot(x, y), np.rad2deg(np.abs(yaw))], axis=1) * (100.0 / length_m)

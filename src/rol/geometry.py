@@ -1,4 +1,4 @@
-"""Poses in the plane and in space: compose, invert, apply, interpolate.
+"""Poses in the plane (SE(2)) and in space: compose, invert, exp, log, transform.
 
 A 2D pose is an array whose last axis holds ``(x, y, yaw)`` in metres and radians; x points forward, y left, and yaw
 turns counter-clockwise. A pose named ``T_a_b`` maps points of frame ``b`` into frame ``a``; it is at the same time the
@@ -12,6 +12,7 @@ from dataclasses import fields
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 # Beyond these, a point is most likely stray.
 MAX_EXTENT_M, MAX_GRID_BYTES = 1e5, 2**33
@@ -60,6 +61,51 @@ def check_poses(poses: np.ndarray, name: str = "poses") -> np.ndarray:
         first = np.argwhere(~np.isfinite(poses))[0]
         raise ValueError(f"{name}: value at index {tuple(int(i) for i in first)} is not finite")
     return poses
+
+
+def check_points(
+    points: np.ndarray,
+    name: str = "points",
+    *,
+    columns: int = 2,
+    more: bool = False,
+    error: type[ValueError] = ValueError,
+) -> np.ndarray:
+    """Check that an array holds finite points.
+
+    Parameters
+    ----------
+    points : array-like, shape (n, columns)
+        Points [m]; n may be zero, and an array without any value is a cloud without points.
+    name : str
+        What the points are called in the message.
+    columns : int
+        Number of coordinates to check.
+    more : bool
+        Allow further columns, which are not checked.
+    error : type
+        Exception to raise.
+
+    Returns
+    -------
+    points : array, shape (n, columns) or more columns
+        The same values as float64, contiguous.
+
+    Raises
+    ------
+    ValueError
+        Or the given ``error``, if the shape is another one or a coordinate is not finite.
+    """
+    points = np.ascontiguousarray(points, dtype=np.float64)
+    if points.size == 0:
+        return points.reshape(0, columns)
+    if points.ndim != 2 or points.shape[1] < columns or (points.shape[1] > columns and not more):
+        wanted = f"(n, {columns})" + (" or more columns" if more else "")
+        raise error(f"{name}: expected points of shape {wanted}, got {points.shape}")
+    is_finite = np.isfinite(points[:, :columns]).all(axis=1)
+    if not is_finite.all():
+        raise error(f"{name}: point {int(np.argmin(is_finite))} is not finite")
+    return points
 
 
 def check_fields(
@@ -166,7 +212,7 @@ def check_grid(
 
 
 def compose(T_a_b: np.ndarray, T_b_c: np.ndarray) -> np.ndarray:
-    """Chain two poses: the pose of c in a.
+    """Compose two poses: the pose of c in a.
 
     Parameters
     ----------
@@ -176,7 +222,7 @@ def compose(T_a_b: np.ndarray, T_b_c: np.ndarray) -> np.ndarray:
     Returns
     -------
     T_a_c : array, shape (..., 3)
-        The chained pose, yaw in [-pi, pi).
+        The composed pose, yaw in [-pi, pi).
     """
     a, b = np.asarray(T_a_b, dtype=np.float64), np.asarray(T_b_c, dtype=np.float64)
     c, s = np.cos(a[..., 2]), np.sin(a[..., 2])
@@ -206,7 +252,7 @@ def invert(T_a_b: np.ndarray) -> np.ndarray:
 
 
 def relative_pose(T_w_a: np.ndarray, T_w_b: np.ndarray) -> np.ndarray:
-    """Give the pose of b as seen from a.
+    """Compute the pose of b in the frame of a.
 
     Parameters
     ----------
@@ -221,15 +267,59 @@ def relative_pose(T_w_a: np.ndarray, T_w_b: np.ndarray) -> np.ndarray:
     return compose(invert(T_w_a), T_w_b)
 
 
-def accumulate_steps(
-    steps: np.ndarray, start: np.ndarray | tuple[float, float, float] = (0.0, 0.0, 0.0)
-) -> np.ndarray:
-    """Chain body-frame steps into a trajectory.
+def exp(twist: np.ndarray | tuple[float, float, float], seconds: np.ndarray | float = 1.0) -> np.ndarray:
+    """Compute the pose reached at a constant body velocity, the exponential map of SE(2).
 
     Parameters
     ----------
-    steps : array, shape (n, 3)
-        Step i is the pose of frame i + 1 in frame i (x, y, yaw) [m, m, rad].
+    twist : array-like, shape (..., 3)
+        Body velocity (vx, vy, yaw rate) [m/s, m/s, rad/s].
+    seconds : array or float, shape (...)
+        Time since the pose was zero, may be negative [s]; leading axes broadcast.
+
+    Returns
+    -------
+    poses : array, shape (..., 3)
+        Pose (x, y, yaw) on the arc [m, m, rad]; yaw is not wrapped.
+    """
+    vx, vy, yaw_rate = np.moveaxis(np.asarray(twist, dtype=np.float64), -1, 0)
+    seconds = np.asarray(seconds, dtype=np.float64)
+    yaw = yaw_rate * seconds
+    along = seconds * np.sinc(yaw / np.pi)  # sin(yaw) / yaw_rate, also where the yaw rate is zero
+    aside = seconds * np.sin(yaw / 2.0) * np.sinc(yaw / (2.0 * np.pi))  # (1 - cos(yaw)) / yaw_rate
+    return np.stack([vx * along - vy * aside, vx * aside + vy * along, yaw], axis=-1)
+
+
+def log(poses: np.ndarray) -> np.ndarray:
+    """Compute the constant body velocity that reaches a pose in one second, the inverse of `exp`.
+
+    Parameters
+    ----------
+    poses : array-like, shape (..., 3)
+        Poses (x, y, yaw) [m, m, rad], yaw in (-2 pi, 2 pi).
+
+    Returns
+    -------
+    twists : array, shape (..., 3)
+        Body velocity (vx, vy, yaw rate) [m/s, m/s, rad/s].
+    """
+    x, y, yaw = np.moveaxis(np.asarray(poses, dtype=np.float64), -1, 0)
+    half = yaw / 2.0
+    stretch = 1.0 / np.sinc(half / np.pi)  # length of the arc over that of its chord
+    vx = (np.cos(half) * x + np.sin(half) * y) * stretch
+    vy = (np.cos(half) * y - np.sin(half) * x) * stretch
+    return np.stack([vx, vy, yaw], axis=-1)
+
+
+def accumulate_increments(
+    increments: np.ndarray, start: np.ndarray | tuple[float, float, float] = (0.0, 0.0, 0.0)
+) -> np.ndarray:
+    """Compose odometry increments into a trajectory.
+
+    Parameters
+    ----------
+    increments : array, shape (n, 3)
+        Increment i is the pose of frame i + 1 in frame i (x, y, yaw) [m, m, rad].
     start : array-like, shape (3,)
         Pose of frame 0 [m, m, rad].
 
@@ -238,12 +328,13 @@ def accumulate_steps(
     poses : array, shape (n + 1, 3)
         Pose of every frame, the start first; yaw in [-pi, pi).
     """
-    steps = check_poses(np.asarray(steps, dtype=np.float64).reshape(-1, 3), "steps")
+    increments = check_poses(np.asarray(increments, dtype=np.float64).reshape(-1, 3), "increments")
     x0, y0, yaw0 = check_poses(start, "start")
-    yaws = yaw0 + np.concatenate([[0.0], np.cumsum(steps[:, 2])])
+    yaws = yaw0 + np.concatenate([[0.0], np.cumsum(increments[:, 2])])
     c, s = np.cos(yaws[:-1]), np.sin(yaws[:-1])
-    x = x0 + np.concatenate([[0.0], np.cumsum(c * steps[:, 0] - s * steps[:, 1])])
-    y = y0 + np.concatenate([[0.0], np.cumsum(s * steps[:, 0] + c * steps[:, 1])])
+    dx, dy = increments[:, 0], increments[:, 1]
+    x = x0 + np.concatenate([[0.0], np.cumsum(c * dx - s * dy)])
+    y = y0 + np.concatenate([[0.0], np.cumsum(s * dx + c * dy)])
     return np.stack([x, y, wrap_angle(yaws)], axis=-1)
 
 
@@ -268,7 +359,7 @@ def transform_points(T_a_b: np.ndarray, points: np.ndarray) -> np.ndarray:
 
 
 def first_of_cells(points: np.ndarray, cell: float) -> np.ndarray:
-    """Keep one point of each square cell: what was seen again and again from one place counts once.
+    """Keep one point per square cell, so that a place observed many times counts once.
 
     Parameters
     ----------
@@ -284,65 +375,6 @@ def first_of_cells(points: np.ndarray, cell: float) -> np.ndarray:
     """
     cells = np.floor(np.asarray(points, dtype=np.float64) / cell).astype(np.int64)
     return points[np.sort(np.unique(cells, axis=0, return_index=True)[1])]
-
-
-def interpolate_poses(stamps_us: np.ndarray, poses: np.ndarray, query_us: np.ndarray) -> np.ndarray:
-    """Interpolate poses linearly in time, headings the short way round.
-
-    Parameters
-    ----------
-    stamps_us : array, shape (n,)
-        Strictly increasing times of the poses [us].
-    poses : array, shape (n, 3)
-        Poses at these times (x, y, yaw) [m, m, rad].
-    query_us : array, shape (m,)
-        Times asked for [us].
-
-    Returns
-    -------
-    poses : array, shape (m, 3)
-        Poses at the times asked for; yaw in [-pi, pi).
-
-    Raises
-    ------
-    ValueError
-        If times do not increase, lengths differ, or a query lies outside the span of the poses.
-    """
-    stamps_us, query_us = np.asarray(stamps_us, dtype=np.int64), np.asarray(query_us, dtype=np.int64)
-    poses = check_poses(poses)
-    if len(stamps_us) != len(poses) or len(poses) == 0:
-        raise ValueError(f"{len(stamps_us)} stamps for {len(poses)} poses")
-    if (np.diff(stamps_us) <= 0).any():
-        raise ValueError(f"stamps do not increase at index {int(np.argmax(np.diff(stamps_us) <= 0)) + 1}")
-    outside = (query_us < stamps_us[0]) | (query_us > stamps_us[-1])
-    if outside.any():
-        raise ValueError(
-            f"time {int(query_us[outside][0])} us lies outside the poses' span {stamps_us[0]} .. {stamps_us[-1]} us"
-        )
-    t, knots = (query_us - stamps_us[0]).astype(float), (stamps_us - stamps_us[0]).astype(float)
-    yaws = np.unwrap(poses[:, 2])
-    x, y, yaw = (np.interp(t, knots, values) for values in (poses[:, 0], poses[:, 1], yaws))
-    return np.stack([x, y, wrap_angle(yaw)], axis=-1)
-
-
-def rotation_from_euler(roll: float, pitch: float, yaw: float) -> np.ndarray:
-    """Build the rotation matrix Rz(yaw) Ry(pitch) Rx(roll).
-
-    Parameters
-    ----------
-    roll, pitch, yaw : float
-        Angles about x, y and z [rad].
-
-    Returns
-    -------
-    R : array, shape (3, 3)
-        Rotation matrix.
-    """
-    (cr, sr), (cp, sp), (cy, sy) = ((np.cos(a), np.sin(a)) for a in (roll, pitch, yaw))
-    Rz = np.array([[cy, -sy, 0.0], [sy, cy, 0.0], [0.0, 0.0, 1.0]])
-    Ry = np.array([[cp, 0.0, sp], [0.0, 1.0, 0.0], [-sp, 0.0, cp]])
-    Rx = np.array([[1.0, 0.0, 0.0], [0.0, cr, -sr], [0.0, sr, cr]])
-    return Rz @ Ry @ Rx
 
 
 def transform_from_euler(x: float, y: float, z: float, roll: float, pitch: float, yaw: float) -> np.ndarray:
@@ -361,7 +393,7 @@ def transform_from_euler(x: float, y: float, z: float, roll: float, pitch: float
         Homogeneous transform.
     """
     T = np.eye(4)
-    T[:3, :3] = rotation_from_euler(roll, pitch, yaw)
+    T[:3, :3] = Rotation.from_euler("xyz", [roll, pitch, yaw]).as_matrix()
     T[:3, 3] = x, y, z
     return T
 
@@ -382,20 +414,3 @@ def transform_points_3d(T_a_b: np.ndarray, points: np.ndarray) -> np.ndarray:
         The same points in frame a [m].
     """
     return points @ T_a_b[:3, :3].T + T_a_b[:3, 3]
-
-
-def flip_y_z(T: np.ndarray) -> np.ndarray:
-    """Turn a 3D transform between y-right z-down frames into y-left z-up frames, or back.
-
-    Parameters
-    ----------
-    T : array, shape (4, 4)
-        Transform between two frames of one convention.
-
-    Returns
-    -------
-    T : array, shape (4, 4)
-        The same motion between the same two frames in the other convention.
-    """
-    F = np.diag([1.0, -1.0, -1.0, 1.0])
-    return F @ T @ F

@@ -1,8 +1,8 @@
-"""The lidar room: bring sweeps into the radar frame, take the ground away, crop.
+"""Transform lidar sweeps into the radar frame, remove the ground, and crop the range.
 
-Points are arrays whose first columns are x, y, z [m]; further columns (intensity, label) travel along
-untouched. Heights are taken in the radar frame, which spins level about 2 m above the road; the vehicle frame
-of the data set is pitched 0.05 rad against it, so a threshold there would cut the ground at a slant.
+Points are arrays whose first columns are x, y, z [m]; further columns (intensity, label) are kept. Heights are those
+in the radar frame, which is level and about 2 m above the road; the vehicle frame of the data set is pitched by
+0.05 rad against it, so a height threshold there would be inclined against the ground.
 """
 
 from __future__ import annotations
@@ -16,25 +16,24 @@ except ImportError:  # this file was copied on its own
 
 
 def relate_sensors(T_vehicle_a: np.ndarray, T_vehicle_b: np.ndarray) -> np.ndarray:
-    """Give the transform from one sensor to another out of two extrinsics.
+    """Compute the transform between two sensors from their extrinsics.
 
     Parameters
     ----------
     T_vehicle_a, T_vehicle_b : array, shape (4, 4)
-        Places of both sensors in the vehicle.
+        Poses of both sensors in the vehicle.
 
     Returns
     -------
     T_a_b : array, shape (4, 4)
         Maps points of sensor b into sensor a.
     """
-    return np.linalg.inv(np.asarray(T_vehicle_a, dtype=np.float64)) @ np.asarray(
-        T_vehicle_b, dtype=np.float64
-    )
+    T_a_vehicle = np.linalg.inv(np.asarray(T_vehicle_a, dtype=np.float64))
+    return T_a_vehicle @ np.asarray(T_vehicle_b, dtype=np.float64)
 
 
 def sweep_to_radar(points: np.ndarray, T_radar_lidar: np.ndarray) -> np.ndarray:
-    """Map a sweep into the radar frame.
+    """Transform a sweep into the radar frame.
 
     Parameters
     ----------
@@ -46,7 +45,7 @@ def sweep_to_radar(points: np.ndarray, T_radar_lidar: np.ndarray) -> np.ndarray:
     Returns
     -------
     points : array, same shape, float64
-        Points in the radar frame [m]; further columns as they were.
+        Points in the radar frame [m]; further columns unchanged.
 
     Notes
     -----
@@ -107,38 +106,38 @@ def crop_range(points: np.ndarray, max_range: float = 64.0, min_range: float = 0
     return points[(ranges <= max_range) & (ranges >= min_range)]
 
 
-def threshold_losses(
+def ground_removal_tradeoff(
     heights: np.ndarray, is_ground: np.ndarray, thresholds: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Count what a height threshold removes of the ground and of everything else.
+    """Compute which fractions of ground and of object points a height threshold removes.
 
     Parameters
     ----------
     heights : array, shape (n,)
         z in the radar frame [m].
     is_ground : array, shape (n,), bool
-        Which points are ground in truth.
+        True for points labelled as ground.
     thresholds : array, shape (k,)
         Values of ``min_height`` to try [m].
 
     Returns
     -------
     ground_removed, objects_removed : array, shape (k,)
-        Shares in 0..1 of the ground points and of the other points that lie below each threshold; nan where
-        there are none of the kind.
+        Fractions, 0..1, of the ground points and of the other points below each threshold; nan if there are no
+        points of the kind.
     """
     heights, is_ground = np.asarray(heights, dtype=np.float64), np.asarray(is_ground, dtype=bool)
     if heights.shape != is_ground.shape:
         raise ValueError(f"{heights.shape} heights for {is_ground.shape} labels")
-    shares = []
+    fractions = []
     for kind in (np.sort(heights[is_ground]), np.sort(heights[~is_ground])):
         below = np.searchsorted(kind, np.asarray(thresholds, dtype=np.float64), side="left")
-        shares.append(below / len(kind) if len(kind) else np.full(len(below), np.nan))
-    return shares[0], shares[1]
+        fractions.append(below / len(kind) if len(kind) else np.full(len(below), np.nan))
+    return fractions[0], fractions[1]
 
 
 def _check_points(points: np.ndarray) -> np.ndarray:
-    """Refuse arrays that do not hold x, y, z in their columns."""
+    """Check that the first columns can be x, y, z; values need not be finite."""
     points = np.asarray(points)
     if points.ndim != 2 or points.shape[1] < 3:
         raise ValueError(f"points: expected shape (n, 3) or more columns, got {points.shape}")

@@ -1,8 +1,8 @@
-"""Point maps: accumulate the clouds of a session, register one map onto another.
+"""Point maps: accumulate the clouds of a session, register one map to another.
 
-The paper's way to ground truth (Sec. IV-A): each session's start is set to zero, its lidar clouds are laid
-down along its own odometry, and each map is registered onto the first session's; the registration, multiplied
-onto the session's poses, gives them in the first map's frame.
+The paper's ground truth (Sec. IV-A): each session starts at the origin, its lidar clouds are accumulated along its own
+odometry, and its map is registered to the map of the first session. The registration, composed with the session's poses,
+transforms them into the first map's frame.
 """
 
 from __future__ import annotations
@@ -18,21 +18,23 @@ from scipy.spatial import cKDTree
 
 try:
     from .files import write_bytes
-    from .geometry import check_grid, check_poses, compose, transform_points
-except ImportError:  # this file was copied on its own
+    from .geometry import check_grid, check_points, check_poses, compose, transform_points
+    from .odometry import IcpSettings, icp_2d
+except ImportError:  # this file was copied into a folder that is no package
     from files import write_bytes
-    from geometry import check_grid, check_poses, compose, transform_points
+    from geometry import check_grid, check_points, check_poses, compose, transform_points
+    from odometry import IcpSettings, icp_2d
 
 
-_WAITING_POINTS = 50_000  # so many points are added to a map at once
+_WAITING_POINTS = 50_000  # number of points that are added to a map at once
 
 
 class MapError(ValueError):
-    """Raised for maps without points and for clouds that do not fit their poses."""
+    """Raised for maps without points and for clouds that do not match their poses."""
 
 
 def thin_points(points: np.ndarray, cell: float) -> tuple[np.ndarray, np.ndarray]:
-    """Keep one point per grid cell: the mean of the cell's points.
+    """Average the points of each grid cell.
 
     Parameters
     ----------
@@ -44,7 +46,7 @@ def thin_points(points: np.ndarray, cell: float) -> tuple[np.ndarray, np.ndarray
     Returns
     -------
     means : array, shape (m, 2)
-        One point per cell that holds any, ordered by cell [m].
+        One point per occupied cell, ordered by cell [m].
     cells : array of int, shape (m, 2)
         Indices of these cells; cell (i, j) spans (i .. i + 1, j .. j + 1) * cell.
     """
@@ -56,29 +58,29 @@ def thin_points(points: np.ndarray, cell: float) -> tuple[np.ndarray, np.ndarray
 def accumulate_map(
     clouds: Iterable[np.ndarray], poses: np.ndarray, cell: float = 0.25, min_hits: int = 2
 ) -> np.ndarray:
-    """Lay clouds down at their poses and keep the cells that several of them hit.
+    """Accumulate clouds at their poses and keep the cells that several of them hit.
 
     Parameters
     ----------
     clouds : iterable of array, shape (n, 2)
-        One cloud per pose, each in its own frame [m]; empty clouds are fine.
+        One cloud per pose, each in its own frame [m]; clouds may be empty.
     poses : array, shape (k, 3)
         Pose of each cloud in the map [m, m, rad].
     cell : float
         Side of a map cell [m].
     min_hits : int
-        Clouds, not points, that must hit a cell; 2 drops what moved or was seen once.
+        Number of clouds, not points, that must hit a cell; 2 removes moving objects and single detections.
 
     Returns
     -------
     points : array, shape (m, 2)
-        One point per kept cell, the mean of what fell into it [m].
+        One point per kept cell, the mean of its points [m].
 
     Raises
     ------
     MapError
-        If there are more or fewer clouds than poses, a point is not finite, or no cell is left. Yin et al.
-        2020, Sec. IV-A.
+        If the numbers of clouds and poses differ, a point is not finite, or no cell is kept. Yin et al. 2020,
+        Sec. IV-A.
     """
     poses, n_clouds, waiting, n_waiting = check_poses(poses), 0, [], 0
     end_mark = np.iinfo(np.int64).max
@@ -86,9 +88,8 @@ def accumulate_map(
     for i, cloud in enumerate(clouds):
         if i >= len(poses):
             raise MapError(f"more clouds than the {len(poses)} poses")
-        if not np.isfinite(cloud).all():
-            raise MapError(f"cloud {i} holds a point that is not finite")
-        waiting.append(thin_points(transform_points(poses[i], np.reshape(cloud, (-1, 2))), cell)[0])
+        cloud = check_points(cloud, f"cloud {i}", error=MapError)
+        waiting.append(thin_points(transform_points(poses[i], cloud), cell)[0])
         n_clouds, n_waiting = n_clouds + 1, n_waiting + len(waiting[-1])
         if n_waiting > _WAITING_POINTS:  # memory grows with the map, not with the clouds
             _add_points(cells, np.concatenate(waiting), cell)
@@ -104,9 +105,9 @@ def accumulate_map(
 
 
 def _add_points(cells: list[np.ndarray], points: np.ndarray, cell: float) -> None:
-    """Add points to their cells (in place): keys in rising order, sums of x and of y, numbers of points.
+    """Add points to their cells (in place): keys in increasing order, sums of x and of y, numbers of points.
 
-    The arrays are replaced one by one, so that only one of them is there twice; the last cell is an end mark.
+    The arrays are replaced one by one, so that only one of them exists twice at a time; the last cell is an end mark.
     """
     indices = np.floor(points / cell).astype(np.int64)
     own = (indices[:, 0] << 32) + indices[:, 1]
@@ -122,31 +123,30 @@ def _add_points(cells: list[np.ndarray], points: np.ndarray, cell: float) -> Non
 
 @dataclass(frozen=True)
 class Registration:
-    """How one map lies on another.
+    """Registration of one map to another.
 
     Attributes
     ----------
     T_target_source : array, shape (3,)
         Pose of the source map in the target map [m, m, rad].
-    share_1m : float
-        Share of the source's points within 1 m of a target point.
+    fraction_1m : float
+        Fraction of the source's points within 1 m of a target point.
     median_m : float
         Median nearest distance from source to target [m].
     converged : bool
-        Whether the finest stage came to rest.
+        Whether the last stage converged.
     stages : tuple of (float, float, float, array)
-        Per stage: reach about the start [m], largest distance of a pair [m], rmse of the pairs [m], the pose
-        after it.
+        Per stage: radius around the start [m], largest distance of a pair [m], RMSE of the pairs [m], resulting pose.
     """
 
     T_target_source: np.ndarray
-    share_1m: float
+    fraction_1m: float
     median_m: float
     converged: bool
     stages: tuple[tuple[float, float, float, np.ndarray], ...]
 
 
-# reach about the source's start, largest and smallest limit of pair distances, cell of thinning [m]
+# Radius around the source's start, largest and smallest limit of pair distances, cell of the averaging [m].
 STAGES = ((100.0, 20.0, 5.0, 1.0), (200.0, 10.0, 3.0, 1.0), (np.inf, 6.0, 2.0, 0.5), (np.inf, 2.0, 0.5, 0.25))
 
 
@@ -158,22 +158,21 @@ def register_maps(
     stages: tuple[tuple[float, float, float, float], ...] = STAGES,
     max_iterations: int = 60,
 ) -> Registration:
-    """Register one map onto another with ICP, from near to far and from coarse to fine.
+    """Register one map to another by ICP, from near to far and from coarse to fine.
 
-    Two sessions that begin at one place agree best there: the first stage takes only what lies about the
-    start, so that a wrong heading cannot carry the far end of the map away from its counterpart.
+    Sessions that start at one place agree best there. The first stage uses only the points around the start, so that a
+    heading error does not displace the far end of the map.
 
     Parameters
     ----------
     source, target : array, shape (n, 2) and (m, 2)
         Maps in their own frames [m].
     init : array-like, shape (3,)
-        First guess of T_target_source [m, m, rad]; zero, as the sessions have the same starting place.
+        Initial guess of T_target_source [m, m, rad]; zero for sessions with the same start.
     stages : tuple of (reach, max_distance, min_distance, cell)
-        Reach about the source's origin, the falling limit of pair distances, cell to which both are thinned
-        [m].
+        Radius around the source's origin, the decreasing limit of pair distances, cell of the averaging of both [m].
     max_iterations : int
-        Iterations of each stage at most.
+        Largest number of iterations of each stage.
 
     Returns
     -------
@@ -185,26 +184,15 @@ def register_maps(
     MapError
         If a map is empty.
     """
-    try:
-        from .odometry import icp_2d
-    except ImportError:  # this file was copied on its own: odometry.py is wanted beside it
-        from odometry import icp_2d
     for points, name in ((source, "source"), (target, "target")):
         if len(points) == 0:
             raise MapError(f"the {name} map is empty")
     pose, done, converged = check_poses(init, "initial guess"), [], False
     for reach, max_distance, min_distance, cell in stages:
         near = thin_points(source[np.hypot(source[:, 0], source[:, 1]) < reach], cell)[0]
-        result = icp_2d(
-            near,
-            thin_points(target, cell)[0],
-            pose,
-            max_distance=max_distance,
-            min_distance=min_distance,
-            max_iterations=max_iterations,
-            tolerance=1e-4,
-            max_points=len(near),
-        )
+        limits = {"max_distance": max_distance, "min_distance": min_distance, "tolerance": 1e-4}
+        settings = IcpSettings(**limits, max_iterations=max_iterations, max_points=max(len(near), 1))
+        result = icp_2d(near, thin_points(target, cell)[0], pose, settings)
         pose, converged = result.T_target_source, result.converged
         done.append((reach, max_distance, result.rmse_m, pose))
     distances = cKDTree(target).query(transform_points(pose, source))[0]
@@ -214,7 +202,7 @@ def register_maps(
 
 
 def to_first_map(T_map_session: np.ndarray, poses: np.ndarray) -> np.ndarray:
-    """Bring a session's own poses into the first map: multiply the registration onto them.
+    """Transform a session's own poses into the frame of the first map.
 
     Parameters
     ----------
@@ -232,7 +220,7 @@ def to_first_map(T_map_session: np.ndarray, poses: np.ndarray) -> np.ndarray:
 
 
 def residuals_along(clouds: Iterable[np.ndarray], poses: np.ndarray, map_points: np.ndarray) -> np.ndarray:
-    """Measure how well each cloud lies on a map at its pose.
+    """Compute the median distance of each cloud to a map.
 
     Parameters
     ----------
@@ -258,7 +246,7 @@ def residuals_along(clouds: Iterable[np.ndarray], poses: np.ndarray, map_points:
 
 
 def save_map(path: Path | str, points: np.ndarray, T_map_session: np.ndarray) -> None:
-    """Write a session's map; the file appears whole or not at all.
+    """Write a session's map, atomically.
 
     Parameters
     ----------
@@ -267,12 +255,12 @@ def save_map(path: Path | str, points: np.ndarray, T_map_session: np.ndarray) ->
     points : array, shape (m, 2)
         Points in the frame of the first map [m].
     T_map_session : array, shape (3,)
-        Registration by which they came there [m, m, rad].
+        Registration of the session's own frame [m, m, rad].
 
     Raises
     ------
     MapError
-        If there is no point, a value is not finite, or the map reaches over more than 100 km.
+        If there is no point, a value is not finite, or the map extends over more than 100 km.
     """
     _check_map(path, points, T_map_session)
     content = io.BytesIO()
@@ -298,10 +286,10 @@ def load_map(path: Path | str) -> tuple[np.ndarray, np.ndarray]:
     Raises
     ------
     MapError
-        If the file is missing, truncated, or holds no map, or one that reaches over more than 100 km.
+        If the file is missing, truncated or no map, or the map extends over more than 100 km.
     """
     if not Path(path).is_file():
-        raise MapError(f"{path}: missing; chapter 06 writes it")
+        raise MapError(f"{path}: missing")
     try:
         with open(path, "rb") as file, np.load(file) as content:
             points, T_map_session = content["points"], content["T_map_session"]
@@ -312,19 +300,17 @@ def load_map(path: Path | str) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _check_map(path: Path | str, points: np.ndarray, T_map_session: np.ndarray) -> None:
-    """Refuse arrays that are no map."""
-    if np.ndim(points) != 2 or np.shape(points)[1] != 2 or np.shape(T_map_session) != (3,):
-        shapes = f"{np.shape(points)} and {np.shape(T_map_session)}"
-        raise MapError(f"{path}: expected points (m, 2) and a pose (3,), got {shapes}")
+    """Check that arrays are a map."""
+    check_points(points, str(path), error=MapError)
     if len(points) == 0:
         raise MapError(f"{path}: the map is empty")
-    if not (np.isfinite(points).all() and np.isfinite(T_map_session).all()):
-        raise MapError(f"{path}: a value is not finite")
+    if np.shape(T_map_session) != (3,) or not np.isfinite(T_map_session).all():
+        raise MapError(f"{path}: expected a finite pose (3,), got {T_map_session}")
     check_grid((1, 1), points, str(path), error=MapError)
 
 
 def _unique_cells(points: np.ndarray, cell: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Give the distinct cells of points, each point's cell, and how many points each cell holds."""
+    """Find the distinct cells of points, the cell of each point, and the number of points of each cell."""
     indices = np.floor(points / cell).astype(np.int64)
     low = indices.min(axis=0) if len(indices) else np.zeros(2, dtype=np.int64)
     width = int(np.ptp(indices[:, 1])) + 1 if len(indices) else 1

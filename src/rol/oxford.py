@@ -1,9 +1,8 @@
-"""One Oxford Radar RobotCar session on disk: readers of its files and, beside them, the writers.
+"""Read a session of the Oxford Radar RobotCar data set: radar, lidars, odometry, GPS and INS.
 
-Oxford's frames have y to the right and z down; they are turned into ours (x forward, y left, z up, yaw
-counter-clockwise) here and nowhere else. Stamps are int64 microseconds. A file that is missing, cut off,
-rotated or at odds with itself raises `OxfordError`, naming file and fault; nothing is repaired in silence.
-Every writer refuses what its reader would refuse, and renames its file into place once it is whole.
+Oxford's frames have y to the right and z down; the readers turn them into x forward, y left, z up, yaw
+counter-clockwise. Stamps are int64 microseconds. A file that is missing, truncated, rotated or inconsistent raises
+`OxfordError`; the message names the file and the fault. Nothing is repaired silently.
 
 Data set: Barnes et al. 2020, "The Oxford Radar RobotCar Dataset"; used in Yin et al. 2020, Sec. IV-A.
 """
@@ -12,6 +11,7 @@ from __future__ import annotations
 
 import io
 import os
+import re
 import zlib
 from collections import Counter
 from dataclasses import dataclass
@@ -22,22 +22,19 @@ import numpy as np
 import pandas as pd
 
 try:
-    from .files import read_text, write_bytes, write_text
-    from .geometry import accumulate_steps, flip_y_z, interpolate_poses, transform_from_euler
+    from .files import read_text
+    from .geometry import accumulate_increments, check_points, transform_from_euler
 except ImportError:  # this file was copied on its own
-    from files import read_text, write_bytes, write_text
-    from geometry import accumulate_steps, flip_y_z, interpolate_poses, transform_from_euler
+    from files import read_text
+    from geometry import accumulate_increments, check_points, transform_from_euler
 
-N_AZIMUTHS, N_BINS, N_HEADER = (
-    400,
-    3768,
-    11,
-)  # radar PNG: a row per azimuth, header bytes before the power bins
+# Radar PNG: one row per azimuth; header bytes before the power bins.
+N_AZIMUTHS, N_BINS, N_HEADER = 400, 3768, 11
 COUNTS_PER_TURN = 5600  # encoder counts of one radar turn, clockwise from straight ahead
 N_LASERS, N_VELODYNE_ROWS = 32, 106  # HDL-32E
 RANGE_UNIT = 0.002  # metres per count of a raw Velodyne range
 FIRE_HEIGHT = 0.090805  # metres from the base of the HDL-32E up to the centre of its lasers
-# Angle of each laser below the horizon [rad], in the row order of the raw file.
+# Angle of each laser of the HDL-32E below the horizon [rad], in the row order of the raw file.
 ELEVATIONS_DOWN = np.array(
     [-0.1862, -0.1628, -0.1396, -0.1164, -0.0930, -0.0698, -0.0466, -0.0232, 0.0, 0.0232, 0.0466]
     + [0.0698, 0.0930, 0.1164, 0.1396, 0.1628, 0.1862, 0.2094, 0.2327, 0.2560, 0.2793, 0.3025]
@@ -48,14 +45,16 @@ MAX_NAME_GAP_US = 100_000  # a sweep's name may lie this far outside the times o
 
 LIDARS = ("velodyne_left", "velodyne_right")
 SENSORS = ("radar", *LIDARS)
-# x y z [m] roll pitch yaw [rad] in the vehicle frame (y right, z down), as in the kit's extrinsics files.
+# x y z [m] roll pitch yaw [rad] in the vehicle frame (y right, z down), as in the SDK's extrinsics files.
 OXFORD_EXTRINSICS = {
     "radar": (-0.71813, 0.12, -0.54479, 0.0, 0.05, 0.0),
     "velodyne_left": (-0.60072, -0.34077, -0.26837, -0.0053948, -0.041998, -3.1337),
     "velodyne_right": (-0.61153, 0.55676, -0.27023, 0.0027052, -0.041999, -3.1357),
 }
+# Signs of x y z roll pitch yaw: y right, z down to y left, z up, and back.
+AXES_SIGNS = np.array([1.0, -1.0, -1.0, 1.0, -1.0, -1.0])
 # T_vehicle_sensor of each sensor, 4 x 4, in our convention.
-EXTRINSICS = {name: flip_y_z(transform_from_euler(*values)) for name, values in OXFORD_EXTRINSICS.items()}
+EXTRINSICS = {k: transform_from_euler(*(AXES_SIGNS * values)) for k, values in OXFORD_EXTRINSICS.items()}
 
 ODOMETRY_COLUMNS = ["source_timestamp", "destination_timestamp", "x", "y", "z", "roll", "pitch", "yaw"]
 ODOMETRY_COLUMNS += ["source_radar_timestamp", "destination_radar_timestamp"]
@@ -63,14 +62,13 @@ GPS_COLUMNS = ["timestamp", "num_satellites", "latitude", "longitude", "altitude
 GPS_COLUMNS += ["longitude_sigma", "altitude_sigma", "northing", "easting", "down", "utm_zone"]
 INS_COLUMNS = ["timestamp", "ins_status", "latitude", "longitude", "altitude", "northing", "easting", "down"]
 INS_COLUMNS += ["utm_zone", "velocity_north", "velocity_east", "velocity_down", "roll", "pitch", "yaw"]
-_TURN = np.array([1.0, -1.0, -1.0, 1.0, -1.0, -1.0])  # x y z roll pitch yaw: y right, z down to y left, z up
 
 
 class OxfordError(ValueError):
     """A file or a session is not what the data set's description says; the message names file and fault."""
 
 
-# ---- bytes in, bytes out ----
+# ---- bytes ----
 
 
 def _read_bytes(path: Path | str) -> bytes:
@@ -116,9 +114,8 @@ def _read_png(path: Path | str, height: int, width: int | None) -> np.ndarray:
         raise OxfordError(f"{path}: PNG is truncated or damaged ({len(data)} bytes)")
     columns, rows = int.from_bytes(data[16:20], "big"), int.from_bytes(data[20:24], "big")
     if (data[24], data[25]) != (8, 0):
-        raise OxfordError(
-            f"{path}: not an 8-bit grey image (bit depth {data[24]}, PNG colour type {data[25]})"
-        )
+        found = f"bit depth {data[24]}, PNG colour type {data[25]}"
+        raise OxfordError(f"{path}: not an 8-bit grey image ({found})")
     if rows != height or columns != (width or columns):
         is_rotated = columns == height and rows == (width or rows)
         hint = "; the image is rotated by 90 deg" if is_rotated else ""
@@ -130,33 +127,12 @@ def _read_png(path: Path | str, height: int, width: int | None) -> np.ndarray:
     return image
 
 
-def _write_png(path: Path | str, image: np.ndarray) -> None:
-    """Encode a grey image fast: level 2 and filter `sub` give the size of the real files in 20 ms a scan."""
-    options = [cv2.IMWRITE_PNG_COMPRESSION, 2, cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_SUB]
-    is_done, data = cv2.imencode(".png", image, options)
-    if not is_done:
-        raise OxfordError(f"{path}: image of shape {image.shape} cannot be encoded")
-    write_bytes(path, data.tobytes())
-
-
-def _cast(path: Path | str, name: str, values: np.ndarray, dtype: type, shape: tuple[int, ...]) -> np.ndarray:
-    """Give values in the file's type; refuse another shape or a value that the type cannot hold."""
-    values = np.asarray(values)
-    if values.shape != shape:
-        raise OxfordError(f"{path}: {name}: expected shape {shape}, got {values.shape}")
-    with np.errstate(invalid="ignore"):
-        cast = values.astype(dtype)
-    if not np.array_equal(cast, values, equal_nan=True):
-        raise OxfordError(f"{path}: {name}: a value does not fit into {np.dtype(dtype).name}")
-    return cast
-
-
 # ---- radar scans ----
 
 
 @dataclass(frozen=True, eq=False)
 class RadarScan:
-    """One turn of the radar as it stands in the file.
+    """One turn of the radar as stored in its file.
 
     Attributes
     ----------
@@ -166,14 +142,14 @@ class RadarScan:
         Encoder count 0..5599 of each row, clockwise seen from above, 0 straight ahead.
     valid : array, shape (400,), uint8
         Raw flag byte: 255 measured, anything else interpolated from neighbouring rows.
-    codes : array, shape (400, 3768), uint8
+    power : array, shape (400, 3768), uint8
         Power in steps of half a decibel, along range.
     """
 
     row_stamps_us: np.ndarray
     counters: np.ndarray
     valid: np.ndarray
-    codes: np.ndarray
+    power: np.ndarray
 
     @property
     def stamp_us(self) -> int:
@@ -187,15 +163,13 @@ class RadarScan:
         return np.cumsum(np.concatenate([self.counters[:1], steps])) * (-2.0 * np.pi / COUNTS_PER_TURN)
 
 
-def _check_radar(path: Path | str, scan: RadarScan) -> None:
-    """Refuse a scan that is at odds with itself or with the file's name."""
+def check_radar(path: Path | str, scan: RadarScan) -> None:
+    """Raise an OxfordError for a scan that contradicts itself or the file's name."""
     stamps = scan.row_stamps_us
-    is_empty = ~scan.codes.any(axis=1) | (stamps == 0)
+    is_empty = ~scan.power.any(axis=1) | (stamps == 0)
     if is_empty.any():
-        first = int(np.argmax(is_empty))
-        raise OxfordError(
-            f"{path}: {is_empty.sum()} all-zero azimuths (no power or no time), first in row {first}"
-        )
+        fault = f"{is_empty.sum()} all-zero azimuths (no power or no time)"
+        raise OxfordError(f"{path}: {fault}, first in row {int(np.argmax(is_empty))}")
     is_back = stamps[1:] < stamps[:-1]
     if is_back.any():
         raise OxfordError(f"{path}: row stamps out of order at row {int(np.argmax(is_back)) + 1}")
@@ -203,9 +177,8 @@ def _check_radar(path: Path | str, scan: RadarScan) -> None:
         raise OxfordError(f"{path}: row stamps {stamps[0]} .. {stamps[-1]} us are not those of one turn")
     steps = np.diff(scan.counters.astype(np.int64)) % COUNTS_PER_TURN
     if scan.counters.max() >= COUNTS_PER_TURN or (steps == 0).any() or steps.sum() >= COUNTS_PER_TURN:
-        raise OxfordError(
-            f"{path}: sweep counters do not go clockwise once around (0..{COUNTS_PER_TURN - 1})"
-        )
+        limit = COUNTS_PER_TURN - 1
+        raise OxfordError(f"{path}: sweep counters do not go clockwise once around (0..{limit})")
     name = Path(path).stem
     if name.isdecimal() and int(name) != scan.stamp_us:
         raise OxfordError(f"{path}: the first row's stamp {scan.stamp_us} is not the file's name")
@@ -222,7 +195,7 @@ def load_radar(path: Path | str) -> RadarScan:
     Returns
     -------
     scan : RadarScan
-        The bytes of the file taken apart; rows flagged as interpolated are kept, see `valid`.
+        Content of the file; rows flagged as interpolated are kept, see `valid`.
 
     Raises
     ------
@@ -234,20 +207,8 @@ def load_radar(path: Path | str) -> RadarScan:
     stamps = np.ascontiguousarray(image[:, :8]).view("<i8").ravel()
     counters = np.ascontiguousarray(image[:, 8:10]).view("<u2").ravel()
     scan = RadarScan(stamps, counters, image[:, 10].copy(), np.ascontiguousarray(image[:, N_HEADER:]))
-    _check_radar(path, scan)
+    check_radar(path, scan)
     return scan
-
-
-def save_radar(path: Path | str, scan: RadarScan) -> None:
-    """Write one radar scan such that `load_radar` gives it back bit for bit; an OxfordError if not."""
-    rows = (N_AZIMUTHS,)
-    stamps = _cast(path, "row_stamps_us", scan.row_stamps_us, np.int64, rows)
-    counters = _cast(path, "counters", scan.counters, np.uint16, rows)
-    valid = _cast(path, "valid", scan.valid, np.uint8, rows)
-    codes = _cast(path, "codes", scan.codes, np.uint8, (N_AZIMUTHS, N_BINS))
-    _check_radar(path, RadarScan(stamps, counters, valid, codes))
-    header = [stamps.astype("<i8")[:, None].view(np.uint8), counters.astype("<u2")[:, None].view(np.uint8)]
-    _write_png(path, np.concatenate([*header, valid[:, None], codes], axis=1))
 
 
 # ---- lidar sweeps ----
@@ -255,7 +216,7 @@ def save_radar(path: Path | str, scan: RadarScan) -> None:
 
 @dataclass(frozen=True, eq=False)
 class VelodyneRaw:
-    """One turn of an HDL-32E as it stands in the raw file: 32 lasers times N firings.
+    """One turn of an HDL-32E as stored in the raw file: 32 lasers times N firings.
 
     Attributes
     ----------
@@ -275,8 +236,8 @@ class VelodyneRaw:
     stamps_us: np.ndarray
 
 
-def _check_velodyne(path: Path | str, raw: VelodyneRaw) -> None:
-    """Refuse a sweep that is at odds with itself or with the file's name."""
+def check_velodyne(path: Path | str, raw: VelodyneRaw) -> None:
+    """Raise an OxfordError for a sweep that contradicts itself or the file's name."""
     stamps = raw.stamps_us
     if (stamps <= 0).any():
         raise OxfordError(f"{path}: firing without a time stamp in column {int(np.argmax(stamps <= 0))}")
@@ -301,7 +262,7 @@ def load_velodyne_raw(path: Path | str) -> VelodyneRaw:
     Returns
     -------
     raw : VelodyneRaw
-        The bytes of the file taken apart.
+        Content of the file.
 
     Raises
     ------
@@ -313,41 +274,26 @@ def load_velodyne_raw(path: Path | str) -> VelodyneRaw:
     intensities, ranges, angles, stamps = map(np.ascontiguousarray, np.split(columns, [32, 96, 98], axis=1))
     angles, stamps = angles.view("<u2").ravel(), stamps.view("<i8").ravel()
     raw = VelodyneRaw(intensities.T, ranges.view("<u2").T, angles, stamps)
-    _check_velodyne(path, raw)
+    check_velodyne(path, raw)
     return raw
 
 
-def save_velodyne_raw(path: Path | str, raw: VelodyneRaw) -> None:
-    """Write one raw sweep such that `load_velodyne_raw` gives it back bit for bit; an OxfordError if not."""
-    n = np.size(raw.stamps_us)
-    if n == 0:
-        raise OxfordError(f"{path}: sweep without a firing")
-    intensities = _cast(path, "intensities", raw.intensities, np.uint8, (N_LASERS, n))
-    ranges = _cast(path, "ranges", raw.ranges, np.uint16, (N_LASERS, n))
-    angles = _cast(path, "angles", raw.angles, np.uint16, (n,))
-    stamps = _cast(path, "stamps_us", raw.stamps_us, np.int64, (n,))
-    _check_velodyne(path, VelodyneRaw(intensities, ranges, angles, stamps))
-    words = ranges.T.astype("<u2", order="C"), angles.astype("<u2")[:, None], stamps.astype("<i8")[:, None]
-    columns = np.concatenate([intensities.T, *(word.view(np.uint8) for word in words)], axis=1)  # (n, 106)
-    _write_png(path, np.ascontiguousarray(columns.T))
-
-
 def velodyne_raw_to_points(raw: VelodyneRaw, min_range_m: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
-    """Turn a raw sweep into points in the lidar's frame.
+    """Convert a raw sweep into points in the lidar's frame.
 
     Parameters
     ----------
     raw : VelodyneRaw
         Sweep of N firings.
     min_range_m : float
-        Returns at this range or nearer are dropped [m]; 1.0 is the data set's own choice.
+        Returns at this range or nearer are dropped [m]; 1.0 as in the SDK.
 
     Returns
     -------
     points : array, shape (n, 4), float32
         x, y, z [m] in the lidar frame (x forward, y left, z up) and intensity, firing after firing.
     stamps_us : array, shape (n,), int64
-        Time of each point [us]. The points are not corrected for the car's motion.
+        Time of each point [us]. The vehicle's motion is not compensated.
     """
     ranges = raw.ranges.T * RANGE_UNIT  # (N, 32)
     is_kept = ranges > min_range_m
@@ -362,10 +308,9 @@ def velodyne_raw_to_points(raw: VelodyneRaw, min_range_m: float = 1.0) -> tuple[
     return points, raw.stamps_us[firings]
 
 
-def _check_points(path: Path | str, points: np.ndarray) -> None:
-    """Refuse points that are not finite or whose intensity is not a byte's."""
-    if not np.isfinite(points).all():
-        raise OxfordError(f"{path}: point {int(np.argwhere(~np.isfinite(points))[0, 0])} is not finite")
+def check_binary(path: Path | str, points: np.ndarray) -> None:
+    """Raise an OxfordError for points that are not finite or whose intensity is not a byte's."""
+    check_points(points, str(path), columns=4, error=OxfordError)
     if points[:, 3].min() < 0 or points[:, 3].max() > 255:
         raise OxfordError(f"{path}: not four rows x, y, z, intensity: the intensities lie outside 0..255")
 
@@ -392,24 +337,15 @@ def load_velodyne_binary(path: Path | str) -> np.ndarray:
     if len(data) % 16:
         raise OxfordError(f"{path}: {len(data)} bytes are not four rows of float32; the file is truncated")
     points = np.frombuffer(data, dtype="<f4").reshape(4, -1).T * np.float32([1, -1, -1, 1])
-    _check_points(path, points)
+    check_binary(path, points)
     return np.ascontiguousarray(points)
-
-
-def save_velodyne_binary(path: Path | str, points: np.ndarray) -> None:
-    """Write points (n, 4), as float32, for `load_velodyne_binary`; an OxfordError if it would refuse them."""
-    points = np.asarray(points, dtype="<f4")
-    if points.ndim != 2 or points.shape[1] != 4 or len(points) == 0:
-        raise OxfordError(f"{path}: expected points of shape (n, 4) with n > 0, got {points.shape}")
-    _check_points(path, points)
-    write_bytes(path, np.ascontiguousarray((points * np.float32([1, -1, -1, 1])).T).tobytes())
 
 
 # ---- text files ----
 
 
-def _check_increasing(path: Path | str, stamps: np.ndarray, first_line: int) -> None:
-    """Refuse stamps that do not strictly increase; `first_line` is the file's line of the first stamp."""
+def check_increasing(path: Path | str, stamps: np.ndarray, first_line: int) -> None:
+    """Raise an OxfordError where stamps do not increase; `first_line` is the file's line of the first stamp."""
     is_wrong = stamps[1:] <= stamps[:-1]
     if is_wrong.any():
         i = int(np.argmax(is_wrong))
@@ -437,54 +373,34 @@ def load_timestamps(path: Path | str) -> tuple[np.ndarray, np.ndarray]:
     OxfordError
         If the file is missing or empty, a line is not a stamp and a flag 0 or 1, or stamps do not increase.
     """
-    lines = [line.split() for line in _read_text(path).splitlines()]
-    for number, fields in enumerate(lines, 1):
-        is_good = (
-            len(fields) == 2 and fields[0].isdecimal() and len(fields[0]) < 19 and fields[1] in ("0", "1")
-        )
-        if not is_good:
-            raise OxfordError(
-                f"{path}: line {number} is not '<microseconds> <0 or 1>': {' '.join(fields)!r:.60}"
-            )
-    stamps = np.array([int(fields[0]) for fields in lines], dtype=np.int64)
-    _check_increasing(path, stamps, first_line=1)
-    return stamps, np.array([fields[1] == "1" for fields in lines], dtype=bool)
+    lines = [" ".join(line.split()) for line in _read_text(path).splitlines()]
+    for number, line in enumerate(lines, 1):
+        if not re.fullmatch(r"\d{1,18} [01]", line, re.ASCII):
+            raise OxfordError(f"{path}: line {number} is not '<microseconds> <0 or 1>': {line!r:.60}")
+    stamps = np.array([int(line[:-2]) for line in lines], dtype=np.int64)
+    check_increasing(path, stamps, first_line=1)
+    return stamps, np.array([line[-1] == "1" for line in lines], dtype=bool)
 
 
-def save_timestamps(path: Path | str, stamps_us: np.ndarray, valid: np.ndarray | None = None) -> None:
-    """Write increasing stamps (n,) [us] and flags (n,), by default all true, as a `*.timestamps` file."""
-    stamps = np.asarray(stamps_us, dtype=np.int64)
-    flags = np.ones(stamps.shape, dtype=bool) if valid is None else np.asarray(valid, dtype=bool)
-    if stamps.ndim != 1 or len(stamps) == 0 or flags.shape != stamps.shape:
-        raise OxfordError(
-            f"{path}: expected n > 0 stamps and as many flags, got {stamps.shape}, {flags.shape}"
-        )
-    _check_increasing(path, stamps, first_line=1)
-    lines = [f"{stamp} {flag:d}\n" for stamp, flag in zip(stamps.tolist(), flags.tolist(), strict=True)]
-    write_text(path, "".join(lines))
-
-
-def _column_type(name: str) -> type:
-    """Give the type of a column of Oxford's csv files."""
+def column_type(name: str) -> type:
+    """Return the type of a column of Oxford's csv files."""
     if name in ("ins_status", "utm_zone"):
         return str
     return np.int64 if "timestamp" in name or name == "num_satellites" else np.float64
 
 
-def _check_table(path: Path | str, table: pd.DataFrame, columns: list[str]) -> None:
-    """Refuse a table with other columns or no row, a value missing or not finite, or times out of order."""
+def check_table(path: Path | str, table: pd.DataFrame, columns: list[str]) -> None:
+    """Raise an OxfordError for other columns, no row, a value missing or not finite, or times out of order."""
     if list(table.columns) != columns or len(table) == 0:
-        missing = ", ".join(name for name in columns if name not in table.columns) or "none"
-        raise OxfordError(
-            f"{path}: no rows, or wrong columns (missing: {missing}); expected {','.join(columns)}"
-        )
+        fault = f"no rows, or wrong columns (missing: {', '.join(c for c in columns if c not in table) or 'none'})"
+        raise OxfordError(f"{path}: {fault}; expected {','.join(columns)}")
     for name in columns:
         values = table[name]
-        is_float = _column_type(name) is np.float64
+        is_float = column_type(name) is np.float64
         is_bad = ~np.isfinite(values.to_numpy()) if is_float else values.isna().to_numpy()
         if is_bad.any():
             raise OxfordError(f"{path}: line {int(np.argmax(is_bad)) + 2}: {name} is missing or not finite")
-    _check_increasing(path, table[columns[0]].to_numpy(np.int64), first_line=2)
+    check_increasing(path, table[columns[0]].to_numpy(np.int64), first_line=2)
 
 
 def _load_table(path: Path | str, columns: list[str]) -> pd.DataFrame:
@@ -501,23 +417,13 @@ def _load_table(path: Path | str, columns: list[str]) -> pd.DataFrame:
     for number, line in enumerate(lines, 1):
         if line.count(",") != len(columns) - 1:
             raise OxfordError(f"{path}: line {number} has {line.count(',') + 1} fields, not {len(columns)}")
-    types = {name: _column_type(name) for name in columns}
+    types = {name: column_type(name) for name in columns}
     try:
         table = pd.read_csv(io.StringIO(text), dtype=types)
     except (ValueError, OverflowError) as error:
         raise OxfordError(f"{path}: a value is missing or not a number: {error}") from error
-    _check_table(path, table, columns)
+    check_table(path, table, columns)
     return table
-
-
-def _save_table(path: Path | str, table: pd.DataFrame, columns: list[str], stamp_digits: int = 0) -> None:
-    """Write a table as Oxford does: six decimals, first column padded with zeros to `stamp_digits`."""
-    _check_table(path, table, columns)
-    counts = [name for name in columns if _column_type(name) is np.int64]
-    fields = {name: _cast(path, name, table[name].to_numpy(), np.int64, (len(table),)) for name in counts}
-    fields[columns[0]] = [f"{stamp:0{stamp_digits}d}" for stamp in fields[columns[0]].tolist()]
-    text = table.assign(**fields).to_csv(index=False, float_format="%.6f", lineterminator="\n")
-    write_text(path, text)
 
 
 def load_gps(path: Path | str) -> pd.DataFrame:
@@ -540,11 +446,6 @@ def load_gps(path: Path | str) -> pd.DataFrame:
         If the file is missing or cut off, lacks a column or a value, or times do not increase.
     """
     return _load_table(path, GPS_COLUMNS)
-
-
-def save_gps(path: Path | str, table: pd.DataFrame) -> None:
-    """Write `gps/gps.csv` from a table as `load_gps` gives it, times padded to 19 digits."""
-    _save_table(path, table, GPS_COLUMNS, stamp_digits=19)
 
 
 def load_ins(path: Path | str) -> pd.DataFrame:
@@ -570,58 +471,14 @@ def load_ins(path: Path | str) -> pd.DataFrame:
     return _load_table(path, INS_COLUMNS)
 
 
-def save_ins(path: Path | str, table: pd.DataFrame) -> None:
-    """Write `gps/ins.csv` from a table as `load_ins` gives it, times padded to 19 digits."""
-    _save_table(path, table, INS_COLUMNS, stamp_digits=19)
-
-
-def load_extrinsics(path: Path | str) -> np.ndarray:
-    """Read where a sensor sits on the vehicle.
-
-    Parameters
-    ----------
-    path : path
-        Text file of one line, `x y z roll pitch yaw` [m, rad], vehicle frame with y right and z down.
-
-    Returns
-    -------
-    T_vehicle_sensor : array, shape (4, 4)
-        The sensor's place in the vehicle frame in our convention (y left, z up).
-
-    Raises
-    ------
-    OxfordError
-        If the file is missing or is not six finite numbers.
-    """
-    text = _read_text(path)
-    try:
-        values = np.array(text.split(), dtype=np.float64)
-    except ValueError:
-        values = np.empty(0)
-    if values.shape != (6,) or not np.isfinite(values).all():
-        raise OxfordError(f"{path}: expected six numbers 'x y z roll pitch yaw', got {text.strip()!r:.60}")
-    return flip_y_z(transform_from_euler(*values))
-
-
-def save_extrinsics(path: Path | str, T_vehicle_sensor: np.ndarray) -> None:
-    """Write T_vehicle_sensor (4 x 4, our convention) as `load_extrinsics` reads it, to ten decimals."""
-    T = flip_y_z(_cast(path, "T_vehicle_sensor", T_vehicle_sensor, np.float64, (4, 4)))
-    roll, yaw = np.arctan2(T[2, 1], T[2, 2]), np.arctan2(T[1, 0], T[0, 0])
-    pitch = np.arctan2(-T[2, 0], np.hypot(T[2, 1], T[2, 2]))
-    values = np.round([*T[:3, 3], roll, pitch, yaw], 10) + 0.0  # plus zero: no "-0"
-    if not np.isfinite(values).all():
-        raise OxfordError(f"{path}: T_vehicle_sensor: a value is not finite")
-    write_text(path, " ".join(f"{value:.10g}" for value in values) + "\n")
-
-
 # ---- radar odometry ----
 
 
 @dataclass(frozen=True, eq=False)
 class RadarOdometry:
-    """The data set's motion from scan to scan, turned into our convention.
+    """Radar odometry of the data set.
 
-    Step i is `T_destination_source`: the pose of the later scan (source) seen from the earlier (destination).
+    Increment i is `T_destination_source`: the pose of the later scan (source) in the earlier one (destination).
 
     Attributes
     ----------
@@ -629,37 +486,34 @@ class RadarOdometry:
         Mid-scan times [us], 122 to 128 ms after the scans' first rows.
     source_radar_stamps_us, destination_radar_stamps_us : array, shape (n,), int64
         First-row times [us], the names of the scans.
-    steps_6dof : array, shape (n, 6)
+    increments_6dof : array, shape (n, 6)
         x, y, z [m], roll, pitch, yaw [rad]; z, roll and pitch are zero in Oxford's files.
     path : str
-        Where it was read, for messages.
+        File, for messages.
     """
 
     source_stamps_us: np.ndarray
     destination_stamps_us: np.ndarray
     source_radar_stamps_us: np.ndarray
     destination_radar_stamps_us: np.ndarray
-    steps_6dof: np.ndarray
+    increments_6dof: np.ndarray
     path: str = "radar odometry"
 
     @property
-    def steps(self) -> np.ndarray:
-        """Steps in the plane, shape (n, 3): x, y, yaw [m, m, rad]."""
-        return self.steps_6dof[:, [0, 1, 5]]
+    def increments(self) -> np.ndarray:
+        """Increments in the plane, shape (n, 3): x, y, yaw [m, m, rad]."""
+        return self.increments_6dof[:, [0, 1, 5]]
 
 
-def _check_odometry(path: Path | str, odometry: RadarOdometry) -> None:
-    """Refuse steps that do not lead forward in time, or frames whose time is not within their scan."""
+def check_odometry(path: Path | str, odometry: RadarOdometry) -> None:
+    """Raise an OxfordError for increments that run backward in time, or times outside their scans."""
     o = odometry
-    mid, first = (
-        (o.source_stamps_us, o.destination_stamps_us),
-        (o.source_radar_stamps_us, o.destination_radar_stamps_us),
-    )
+    mid = np.stack([o.source_stamps_us, o.destination_stamps_us])
+    first = np.stack([o.source_radar_stamps_us, o.destination_radar_stamps_us])
+    is_outside = ((mid < first) | (mid > first + MAX_TURN_US)).any(axis=0)
     faults = {
         "the source is not later than the destination": (mid[0] <= mid[1]) | (first[0] <= first[1]),
-        "a frame's time lies outside its radar scan": np.any(
-            [(m < f) | (m > f + MAX_TURN_US) for m, f in zip(mid, first, strict=True)], axis=0
-        ),
+        "a frame's time lies outside its radar scan": is_outside,
     }
     for fault, is_bad in faults.items():
         if is_bad.any():
@@ -669,8 +523,8 @@ def _check_odometry(path: Path | str, odometry: RadarOdometry) -> None:
 def load_radar_odometry(path: Path | str) -> RadarOdometry:
     """Read `gt/radar_odometry.csv`.
 
-    A session of n scans has n - 2 rows. They join its scans 0 to n - 2 without a gap, so every scan but the
-    last has a pose (seen in 2019-01-10-11-46-21: 8867 stamps, 8865 rows, 8866 poses).
+    A session of n scans has n - 2 rows. They connect its scans 0 to n - 2 without a gap, so every scan but the
+    last has a pose (2019-01-10-11-46-21: 8867 stamps, 8865 rows, 8866 poses).
 
     Parameters
     ----------
@@ -680,7 +534,7 @@ def load_radar_odometry(path: Path | str) -> RadarOdometry:
     Returns
     -------
     odometry : RadarOdometry
-        Steps in our convention: y, z, pitch and yaw change their sign.
+        Increments with y left and yaw counter-clockwise: y, z, pitch and yaw change their sign.
 
     Raises
     ------
@@ -690,32 +544,21 @@ def load_radar_odometry(path: Path | str) -> RadarOdometry:
     """
     table = _load_table(path, ODOMETRY_COLUMNS)
     stamps = (table[name].to_numpy(np.int64) for name in ODOMETRY_COLUMNS if "timestamp" in name)
-    odometry = RadarOdometry(*stamps, table[ODOMETRY_COLUMNS[2:8]].to_numpy(np.float64) * _TURN, str(path))
-    _check_odometry(path, odometry)
+    increments = table[ODOMETRY_COLUMNS[2:8]].to_numpy(np.float64) * AXES_SIGNS
+    odometry = RadarOdometry(*stamps, increments, str(path))
+    check_odometry(path, odometry)
     return odometry
-
-
-def save_radar_odometry(path: Path | str, odometry: RadarOdometry) -> None:
-    """Write `gt/radar_odometry.csv`, six decimals; what was read is written back byte for byte."""
-    o, n = odometry, len(odometry.steps_6dof)
-    mid = (o.source_stamps_us, o.destination_stamps_us)
-    first = (o.source_radar_stamps_us, o.destination_radar_stamps_us)
-    mid, first = ([_cast(path, "stamps", stamps, np.int64, (n,)) for stamps in pair] for pair in (mid, first))
-    steps = _cast(path, "steps_6dof", o.steps_6dof, np.float64, (n, 6)) * _TURN
-    _check_odometry(path, RadarOdometry(*mid, *first, steps))
-    values = zip(ODOMETRY_COLUMNS, [*mid, *steps.T, *first], strict=True)
-    _save_table(path, pd.DataFrame(dict(values)), ODOMETRY_COLUMNS)
 
 
 def compose_odometry(
     odometry: RadarOdometry, start: np.ndarray | tuple[float, float, float] = (0.0, 0.0, 0.0)
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Chain the steps into the radar's trajectory.
+    """Compose the increments into the radar's trajectory.
 
     Parameters
     ----------
     odometry : RadarOdometry
-        n steps, each one beginning where the one before it ends.
+        n increments, each one starting where the previous one ends.
     start : array-like, shape (3,)
         Pose of the first scan [m, m, rad].
 
@@ -731,7 +574,7 @@ def compose_odometry(
     Raises
     ------
     OxfordError
-        If there is a gap between two steps.
+        If there is a gap between two increments.
     """
     o = odometry
     is_gap = o.destination_radar_stamps_us[1:] != o.source_radar_stamps_us[:-1]
@@ -742,40 +585,7 @@ def compose_odometry(
         raise OxfordError(f"{o.path}: gap before line {i + 3}: from scan {end} to scan {begin}")
     radar_stamps = np.concatenate([o.destination_radar_stamps_us[:1], o.source_radar_stamps_us])
     mid_stamps = np.concatenate([o.destination_stamps_us[:1], o.source_stamps_us])
-    return radar_stamps, mid_stamps, accumulate_steps(o.steps, start)
-
-
-def poses_at(
-    odometry: RadarOdometry,
-    stamps_us: np.ndarray,
-    start: np.ndarray | tuple[float, float, float] = (0.0, 0.0, 0.0),
-) -> np.ndarray:
-    """Give the radar's pose at any times within the odometry's span, interpolated between mid-scan times.
-
-    Parameters
-    ----------
-    odometry : RadarOdometry
-        The steps of a session.
-    stamps_us : array, shape (m,)
-        Times asked for [us].
-    start : array-like, shape (3,)
-        Pose of the first scan at its mid-scan time [m, m, rad].
-
-    Returns
-    -------
-    poses : array, shape (m, 3)
-        T_start_radar at these times (x, y, yaw) [m, m, rad].
-
-    Raises
-    ------
-    OxfordError
-        If a time lies before the first or after the last pose, or the steps have a gap.
-    """
-    _, mid_stamps, poses = compose_odometry(odometry, start)
-    try:
-        return interpolate_poses(mid_stamps, poses, np.atleast_1d(stamps_us))
-    except ValueError as error:
-        raise OxfordError(f"{odometry.path}: {error}") from error
+    return radar_stamps, mid_stamps, accumulate_increments(o.increments, start)
 
 
 # ---- a whole session ----
@@ -783,7 +593,7 @@ def poses_at(
 
 @dataclass(frozen=True, eq=False)
 class Session:
-    """One drive on disk. Made by `open_session`.
+    """One session on disk, from `open_session`.
 
     Attributes
     ----------
@@ -794,7 +604,7 @@ class Session:
     radar_stamps_us : array, shape (n,), int64
         Names of the scans [us]. Stamps flagged 0 are left out, here and below.
     left_stamps_us, right_stamps_us : array, shape (m,), int64, or None
-        Names of the left and right lidar's sweeps [us]; None where the session has no such lidar.
+        Names of the left and right lidar's sweeps [us]; None if the session has no such lidar.
     """
 
     root: Path
@@ -819,11 +629,11 @@ class Session:
         return self.root / "gps" / "ins.csv"
 
     def radar_path(self, stamp_us: int) -> Path:
-        """Give the path of the scan of a stamp [us]."""
+        """Return the path of the scan of a stamp [us]."""
         return self.root / "radar" / f"{int(stamp_us)}.png"
 
     def sweep_path(self, sensor: str, stamp_us: int) -> Path:
-        """Give the path of a lidar's sweep, the raw .png or else the .bin; an OxfordError without either."""
+        """Return the path of a lidar's sweep, the raw .png or else the .bin; an OxfordError without either."""
         if sensor not in LIDARS:
             raise OxfordError(f"{self.root}: no lidar is called {sensor!r}; there are {', '.join(LIDARS)}")
         if (self.left_stamps_us if sensor == "velodyne_left" else self.right_stamps_us) is None:
@@ -846,8 +656,8 @@ def open_session(path: Path | str) -> Session:
     Parameters
     ----------
     path : path
-        Folder that holds `radar/` and `radar.timestamps`; lidars may be missing. A virtual session (its name
-        begins with `virtual-`) must hold the `session.json` that its maker writes last.
+        Folder that holds `radar/` and `radar.timestamps`; lidars may be missing. A simulated session (its name
+        begins with `sim-`) must hold the `session.json` that its maker writes last.
 
     Returns
     -------
@@ -860,7 +670,7 @@ def open_session(path: Path | str) -> Session:
         If there is no such session or it is incomplete; the message lists the sessions beside it.
     """
     root = Path(os.path.abspath(path))
-    files = ["radar.timestamps"] + (["session.json"] if root.name.startswith("virtual-") else [])
+    files = ["radar.timestamps"] + (["session.json"] if root.name.startswith("sim-") else [])
     missing = [] if (root / "radar").is_dir() else ["radar"]
     missing += [name for name in files if not (root / name).is_file()]
     if missing:
@@ -873,7 +683,7 @@ def open_session(path: Path | str) -> Session:
 
 
 def load_sweep(session: Session, sensor: str, stamp_us: int) -> tuple[np.ndarray, np.ndarray]:
-    """Read a lidar sweep of a session in whichever format it is there.
+    """Read a lidar sweep of a session in the format that is present.
 
     Parameters
     ----------
@@ -904,7 +714,7 @@ def load_sweep(session: Session, sensor: str, stamp_us: int) -> tuple[np.ndarray
 
 
 def _describe(path: Path, items: np.ndarray | list, what: str) -> list[str]:
-    """Give the sentence '<path>: <count> <what>, the first: <item>', or nothing for no items."""
+    """Format '<path>: <count> <what>, the first: <item>'; an empty list for no items."""
     return [f"{path}: {len(items)} {what}, the first: {items[0]}"] if len(items) else []
 
 
@@ -912,24 +722,17 @@ def _find_sensor_faults(session: Session, sensor: str) -> list[str]:
     """Compare a sensor's list of stamps with its files; name flags of 0 and gaps."""
     listing, folder = session.root / f"{sensor}.timestamps", session.root / sensor
     found = ((listing, "file", listing.is_file()), (folder, "folder", folder.is_dir()))
-    missing = [
-        (path, f"not a {kind}" if path.exists() else "missing")
-        for path, kind, is_there in found
-        if not is_there
-    ]
-    if missing:
-        return [f"{path}: {fault}" for path, fault in missing]
+    absent = [(path, kind) for path, kind, is_there in found if not is_there]
+    if absent:
+        return [f"{path}: {f'not a {kind}' if path.exists() else 'missing'}" for path, kind in absent]
     stamps, valid = load_timestamps(listing)
-    sizes = {
-        entry.name: entry.is_file() and entry.stat().st_size
-        for entry in os.scandir(folder)
-        if entry.name[0] != "."
-    }
+    entries = [entry for entry in os.scandir(folder) if entry.name[0] != "."]
+    sizes = {entry.name: entry.is_file() and entry.stat().st_size for entry in entries}
     suffixes = (".png",) if sensor == "radar" else (".png", ".bin")
     frames = {name for name in sizes if name.endswith(suffixes) and name[:-4].isdecimal() and len(name) < 23}
     on_disk = np.unique(np.array([int(name[:-4]) for name in frames], dtype=np.int64))
     intervals = np.diff(stamps)
-    # A session may hold only the sweeps that scans need, 0.1 and 0.15 s apart in turn; the radar misses no turn.
+    # A session may hold only the sweeps that scans need, 0.1 and 0.15 s apart in turn; the radar skips no turn.
     longest = (1.5 if sensor == "radar" else 3.5) * np.median(intervals) if len(intervals) else 0.0
     is_gap = intervals > longest
     gaps = [f"{t / 1e6:.3f} s after {s}" for t, s in zip(intervals[is_gap], stamps[:-1][is_gap], strict=True)]
@@ -949,9 +752,8 @@ def _find_cover_faults(session: Session) -> list[str]:
     for sensor, stamps in zip(LIDARS, (session.left_stamps_us, session.right_stamps_us), strict=True):
         if stamps is not None:
             nearest = np.searchsorted(stamps, [scans - MAX_NAME_GAP_US, scans + MAX_NAME_GAP_US])
-            faults += _describe(
-                session.root / sensor, scans[nearest[0] == nearest[1]], "scans without a sweep near"
-            )
+            bare = scans[nearest[0] == nearest[1]]
+            faults += _describe(session.root / sensor, bare, "scans without a sweep near")
     return faults
 
 
@@ -960,16 +762,17 @@ def _find_odometry_faults(session: Session) -> list[str]:
     path, scans = session.odometry_path, session.radar_stamps_us
     stamps, _, _ = compose_odometry(load_radar_odometry(path))
     late, inside = scans[scans > stamps[-1]], scans[(scans >= stamps[0]) & (scans <= stamps[-1])]
+    late, bare = late if len(late) > 1 else [], inside[~np.isin(inside, stamps)]
     return [
         *_describe(path, scans[scans < stamps[0]], "scans before the first pose"),
-        *_describe(path, late if len(late) > 1 else [], "scans after the last pose, the truth ends early"),
-        *_describe(path, inside[~np.isin(inside, stamps)], "scans without a pose within the truth's span"),
+        *_describe(path, late, "scans after the last pose, the ground truth ends early"),
+        *_describe(path, bare, "scans without a pose within the ground truth's span"),
         *_describe(path, stamps[~np.isin(stamps, scans)], "poses without a scan in radar.timestamps"),
     ]
 
 
 def check_session(session: Session) -> list[str]:
-    """Look through a session for the faults that users of the data set meet, without decoding images.
+    """Check a session for the faults that users of the data set meet, without decoding images.
 
     Parameters
     ----------
@@ -979,7 +782,7 @@ def check_session(session: Session) -> list[str]:
     Returns
     -------
     faults : list of str
-        One sentence per fault, naming the file; empty when all is well. Looked for: a sensor that is missing,
+        One sentence per fault, naming the file; empty without faults. Checked: a sensor that is missing,
         stamps flagged 0, stamps without a file and files without a stamp, empty files, gaps between frames,
         scans without a sweep within 0.1 s, odometry that is missing, broken or ends early, gps.csv or ins.csv
         missing or broken.

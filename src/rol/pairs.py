@@ -1,17 +1,17 @@
-"""The pairs room: which sweep belongs to which scan, one aligned pair of images, and pairs as files.
+"""Pair radar scans with lidar sweeps: association in time, aligned images, and folders of images.
 
-A pair is a radar image and a lidar image, both uint8 with the sensor in the middle (axes as in the bird's-eye
-room: row 0 farthest forward, column 0 farthest left, pixel centres). On disk a folder holds
-``radar/<us>.png`` and ``lidar/<us>.png``, named by the radar's stamp, ``settings.json`` from the start and
-``pairs.json`` once all is there.
+A pair is a radar image and a lidar image, both uint8 with the sensor in the middle: row 0 farthest forward, column 0
+farthest left, pixel centres. A folder of pairs holds ``radar/<us>.png`` and ``lidar/<us>.png``, named by the radar's
+stamp, ``settings.json`` from the start and ``pairs.json`` once all pairs are there. A folder of generated lidar images
+holds ``<us>.png`` and ``fake.json`` in the same way.
 """
 
 from __future__ import annotations
 
 import hashlib
-import json
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
+from dataclasses import asdict, dataclass, fields
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
@@ -20,33 +20,64 @@ import cv2
 import numpy as np
 
 try:
-    from .files import prepare_images, read_text, write_bytes, write_text
+    from .bev import image_to_points, normalize_image, points_to_image
+    from .files import ImageFolder, write_bytes
+    from .geometry import check_fields, log
+    from .lidar import crop_range, relate_sensors, remove_ground, sweep_to_radar
+    from .oxford import EXTRINSICS, RadarOdometry, Session, load_radar, load_sweep
+    from .radar import (
+        DOPPLER_SECONDS,
+        MEASURED,
+        RangeCalibration,
+        ScanMotion,
+        compensate_points,
+        deskew_points,
+        polar_to_cartesian,
+    )
 except ImportError:  # this file was copied on its own
-    from files import prepare_images, read_text, write_bytes, write_text
+    from bev import image_to_points, normalize_image, points_to_image
+    from files import ImageFolder, write_bytes
+    from geometry import check_fields, log
+    from lidar import crop_range, relate_sensors, remove_ground, sweep_to_radar
+    from oxford import EXTRINSICS, RadarOdometry, Session, load_radar, load_sweep
+    from radar import (
+        DOPPLER_SECONDS,
+        MEASURED,
+        RangeCalibration,
+        ScanMotion,
+        compensate_points,
+        deskew_points,
+        polar_to_cartesian,
+    )
 
+FORMAT = 2  # of the pairs; raise it when the same settings give other images
 SIDES = ("radar", "lidar")
+MOTIONS = ("none", "corrected")
+
+
+# ---- association in time ----
 
 
 def associate_nearest(
     stamps_us: np.ndarray, other_stamps_us: np.ndarray, max_gap_us: int = 50_000
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Find for every time the nearest of some other times.
+    """Find the nearest other time for every time.
 
     Parameters
     ----------
     stamps_us : array, shape (n,)
-        Times asked about [us].
+        Query times [us].
     other_stamps_us : array, shape (m,)
         Strictly increasing times to choose from [us].
     max_gap_us : int
-        Gaps above this are no match [us].
+        Larger gaps are no match [us].
 
     Returns
     -------
     index : array, shape (n,), int64
         Index of the nearest other time, the earlier of two equally near; -1 where the gap is too large.
     gap_us : array, shape (n,), int64
-        Nearest other time minus own time, given for the refused ones too [us].
+        Nearest other time minus own time, also for those without a match [us].
 
     Raises
     ------
@@ -70,68 +101,253 @@ def associate_nearest(
     return np.where(np.abs(gap_us) <= max_gap_us, index, -1), gap_us
 
 
-def estimate_twists(odometry: Any) -> np.ndarray:
-    """Estimate the radar's velocity at every scan from the steps between scans.
+def estimate_twists(odometry: RadarOdometry) -> np.ndarray:
+    """Estimate the radar's velocity at every scan from the odometry increments.
 
     Parameters
     ----------
-    odometry : rol.oxford.RadarOdometry
-        ``steps`` (n, 3) with the later scan in the earlier one [m, m, rad] and the times of both at mid-scan,
-        ``destination_stamps_us`` and ``source_stamps_us`` (n,) [us].
+    odometry : RadarOdometry
+        ``increments`` (n, 3) [m, m, rad] and the mid-scan times ``destination_stamps_us`` and
+        ``source_stamps_us`` (n,) [us].
 
     Returns
     -------
     twists : array, shape (n + 1, 3)
-        Body velocity (vx, vy, yaw rate) of each scan of the chain [m/s, m/s, rad/s]: between two steps the
-        mean, weighted so that it holds at the scan itself, at the ends the one step there is.
+        Body velocity (vx, vy, yaw rate) at each scan [m/s, m/s, rad/s]: between two increments the mean, weighted so
+        that it holds at the scan itself; at the ends that of the one increment.
 
     Raises
     ------
     ValueError
-        If there is no step, a step takes no time, or the steps are not one chain.
+        If there is no increment, one takes no time, or they are not consecutive.
     """
-    steps = np.asarray(odometry.steps, dtype=np.float64)
+    increments = np.asarray(odometry.increments, dtype=np.float64)
     later, earlier = np.asarray(odometry.source_stamps_us), np.asarray(odometry.destination_stamps_us)
-    if len(steps) == 0:
-        raise ValueError("odometry: no step to take a velocity from")
+    if len(increments) == 0:
+        raise ValueError("odometry: no increment to take a velocity from")
     if (later <= earlier).any() or (later[:-1] != earlier[1:]).any():
-        raise ValueError("odometry: steps do not form one chain forward in time")
+        raise ValueError("odometry: increments do not form one chain forward in time")
     seconds = (later - earlier) / 1e6
-    half = steps[:, 2] / 2.0
-    # Constant twist moves on an arc: the chord turned back by half the yaw, stretched to the arc's length.
-    stretch = 1.0 / np.sinc(half / np.pi)
-    vx = (np.cos(half) * steps[:, 0] + np.sin(half) * steps[:, 1]) * stretch
-    vy = (np.cos(half) * steps[:, 1] - np.sin(half) * steps[:, 0]) * stretch
-    rates = np.stack([vx, vy, steps[:, 2]], axis=1) / seconds[:, None]
+    rates = log(increments) / seconds[:, None]
     weight = (seconds[1:] / (seconds[:-1] + seconds[1:]))[:, None]
     return np.concatenate([rates[:1], weight * rates[:-1] + (1.0 - weight) * rates[1:], rates[-1:]])
 
 
-def job_of_row(row: Any) -> dict[str, Any]:
-    """Turn a row of ``alignment.csv`` into the arguments of `build_pair` that change from pair to pair.
+def usable_stamps(session: Session, sensor: str) -> np.ndarray:
+    """List the frames of a sensor that can be read: listed, not flagged 0, with a file.
 
     Parameters
     ----------
-    row : mapping
-        Row with the columns of `rol.alignment.align_scans`.
+    session : Session
+        The session.
+    sensor : str
+        "radar", "velodyne_left" or "velodyne_right".
 
     Returns
     -------
-    job : dict
-        ``radar_stamp``, ``left_stamp``, ``right_stamp``, ``mid_stamp_us`` [us] and ``twist`` [m/s, m/s,
-        rad/s]. The stamp of a lidar that has no column is None.
+    stamps_us : array, shape (n,), int64
+        Their stamps [us].
+
+    Raises
+    ------
+    ValueError
+        If there is no such frame; the message names the folder.
     """
-    job: dict[str, Any] = {"radar_stamp": int(row["radar_stamp_us"])}
-    for name in ("left", "right"):
-        job[f"{name}_stamp"] = int(row[f"{name}_stamp_us"]) if f"{name}_stamp_us" in row else None
-    twist = tuple(float(row[name]) for name in ("vx_mps", "vy_mps", "yaw_rate_radps"))
-    return {**job, "mid_stamp_us": int(row["mid_stamp_us"]), "twist": twist}
+    listed = {
+        "radar": session.radar_stamps_us,
+        "velodyne_left": session.left_stamps_us,
+        "velodyne_right": session.right_stamps_us,
+    }[sensor]
+    folder = session.root / sensor
+    there = {p.stem for p in folder.iterdir() if p.suffix in (".png", ".bin")} if folder.is_dir() else set()
+    kept = [stamp for stamp in (() if listed is None else listed.tolist()) if str(stamp) in there]
+    if not kept:
+        raise ValueError(f"{folder}: no usable frame of {sensor}; a pair needs the radar and a lidar")
+    return np.array(kept, dtype=np.int64)
+
+
+def usable_sweeps(session: Session) -> dict[str, np.ndarray]:
+    """List the usable sweeps of the lidars that a session has.
+
+    Parameters
+    ----------
+    session : Session
+        The session.
+
+    Returns
+    -------
+    sweeps_us : dict of array, int64
+        "left", "right" or both -> stamps of the sweeps [us], as of `usable_stamps`.
+
+    Raises
+    ------
+    ValueError
+        If neither lidar has a usable sweep; the message names the folders.
+    """
+    found, faults = {}, []
+    for side in ("left", "right"):
+        try:
+            found[side] = usable_stamps(session, f"velodyne_{side}")
+        except ValueError as error:
+            faults.append(str(error))
+    if not found:
+        raise ValueError("; ".join(faults))
+    return found
+
+
+def align_scans(
+    radar_us: np.ndarray,
+    mid_us: np.ndarray,
+    twists: np.ndarray,
+    sweeps_us: dict[str, np.ndarray],
+    *,
+    motion: str = "none",
+    max_gap_us: int = 50_000,
+) -> dict[str, np.ndarray]:
+    """Find the sweeps of every scan; scans without a sweep of each lidar are left out.
+
+    Parameters
+    ----------
+    radar_us, mid_us : array, shape (n,)
+        Stamps of the scans and their times at mid-scan [us].
+    twists : array, shape (n, 3)
+        Body velocities [m/s, m/s, rad/s].
+    sweeps_us : dict of array
+        Stamps of the sweeps [us] by lidar, "left", "right" or both, as from `usable_sweeps`.
+    motion : str
+        "none" takes the sweeps nearest to the scan's stamp, "corrected" those nearest to mid-scan.
+    max_gap_us : int
+        Largest gap allowed [us].
+
+    Returns
+    -------
+    columns : dict of arrays, shape (p,)
+        The columns of ``alignment.csv``; stamps [us], gaps (sweep minus scan) [ms], velocities [m/s, rad/s].
+        A lidar that the session does not have has no columns.
+
+    Raises
+    ------
+    ValueError
+        If no lidar or an unknown one is given, or no scan has its sweeps within `max_gap_us`; the message gives
+        the smallest gap of each lidar.
+
+    Notes
+    -----
+    Yin et al. 2020, Sec. III-A, is "none".
+    """
+    _check_motion(motion)
+    if not sweeps_us or not sweeps_us.keys() <= {"left", "right"}:
+        raise ValueError(f"sweeps_us must have the keys 'left', 'right' or both, not {list(sweeps_us)}")
+    reference = radar_us if motion == "none" else mid_us
+    matches = {side: associate_nearest(reference, us, max_gap_us) for side, us in sweeps_us.items()}
+    kept = np.all([index >= 0 for index, _ in matches.values()], axis=0)
+    if not kept.any():
+        least = ", ".join(
+            f"{side} {(np.abs(gap) / 1e3).min(initial=np.inf):g} ms" for side, (_, gap) in matches.items()
+        )
+        place = "its stamp" if motion == "none" else "mid-scan"
+        raise ValueError(
+            f"motion {motion!r}: no scan has its sweeps within {max_gap_us / 1000:g} ms of {place};"
+            f" the smallest gaps are {least}"
+        )
+    columns = {"radar_stamp_us": radar_us[kept], "mid_stamp_us": mid_us[kept]}
+    for side, (index, _) in matches.items():
+        columns[f"{side}_stamp_us"] = sweeps_us[side][index[kept]]
+    for side, (_, gap_us) in matches.items():
+        columns[f"{side}_gap_ms"] = gap_us[kept] / 1000.0
+    for i, name in enumerate(("vx_mps", "vy_mps", "yaw_rate_radps")):
+        columns[name] = twists[kept, i]
+    return columns
+
+
+# ---- aligned pairs ----
+
+
+@dataclass(frozen=True)
+class AlignedScan:
+    """A radar scan with the sweeps that belong to it.
+
+    Attributes
+    ----------
+    radar_stamp_us : int
+        Stamp of the scan [us].
+    left_stamp_us, right_stamp_us : int or None
+        Stamps of the two sweeps [us]; None for a lidar that the session does not have.
+    mid_stamp_us : int, optional
+        Time of mid-scan [us]; 125 ms after the scan's stamp if not given.
+    twist : tuple of float, optional
+        Body velocity of the radar [m/s, m/s, rad/s]; needed for motion compensation.
+    """
+
+    radar_stamp_us: int
+    left_stamp_us: int | None
+    right_stamp_us: int | None
+    mid_stamp_us: int | None = None
+    twist: tuple[float, float, float] | None = None
+
+    @classmethod
+    def from_row(cls, row: Any) -> AlignedScan:
+        """Read a row (mapping) with the columns of `align_scans`."""
+        lidars = [row[name] if (name := f"{side}_stamp_us") in row else None for side in ("left", "right")]
+        lidars = [None if stamp is None else int(stamp) for stamp in lidars]
+        twist = tuple(float(row[name]) for name in ("vx_mps", "vy_mps", "yaw_rate_radps"))
+        return cls(int(row["radar_stamp_us"]), *lidars, int(row["mid_stamp_us"]), twist)
+
+
+@dataclass(frozen=True)
+class PairSettings:
+    """Settings of pairs of images.
+
+    Attributes
+    ----------
+    motion : str
+        "none" takes scan and sweeps as they are, as the paper does; "corrected" brings both to mid-scan and corrects
+        the Doppler shift.
+    range_resolution, range_offset : float
+        Length of a bin and offset of all ranges of the radar [m].
+    doppler_seconds : float
+        Ranges read nearer by this time multiplied by the closing speed [s]; used with "corrected".
+    min_height, max_range : float
+        Lowest z and largest range of the lidar points kept, in the radar frame [m].
+    width, pixel_size : int, float
+        Pixels along an edge, and the edge of a pixel [m].
+
+    Raises
+    ------
+    ValueError
+        If the motion is unknown or a value is out of its range; the message names it.
+    """
+
+    motion: str = "none"
+    range_resolution: float = MEASURED.resolution_m
+    range_offset: float = MEASURED.offset_m
+    doppler_seconds: float = DOPPLER_SECONDS
+    min_height: float = -1.5
+    max_range: float = 64.0
+    width: int = 512
+    pixel_size: float = 0.25
+
+    def __post_init__(self) -> None:
+        _check_motion(self.motion)
+        allowed = {
+            "(0, inf)": "range_resolution pixel_size",
+            "(0, inf]": "max_range",
+            "(-inf, inf)": "range_offset doppler_seconds",
+            "[-inf, inf)": "min_height",
+            "[1, inf)": "width",
+        }
+        check_fields(self, allowed)
+
+    @classmethod
+    def from_dict(cls, values: dict[str, Any]) -> PairSettings:
+        """Take the settings among the entries of a dict, such as the header of weights; defaults for the others."""
+        return cls(**{field.name: values[field.name] for field in fields(cls) if field.name in values})
 
 
 def load_lidar_points(
-    session: Any,
-    left_stamp: int | None,
-    right_stamp: int | None,
+    session: Session,
+    left_stamp_us: int | None,
+    right_stamp_us: int | None,
     *,
     mid_stamp_us: int | None = None,
     twist: np.ndarray | Sequence[float] | None = None,
@@ -140,9 +356,9 @@ def load_lidar_points(
 
     Parameters
     ----------
-    session : rol.oxford.Session
+    session : Session
         The session.
-    left_stamp, right_stamp : int or None
+    left_stamp_us, right_stamp_us : int or None
         Stamps of the two sweeps [us]; None for a lidar that the session does not have.
     mid_stamp_us : int, optional
         Time at which the radar frame is meant; needed with a twist [us].
@@ -159,119 +375,155 @@ def load_lidar_points(
     ValueError
         If there is a twist and no ``mid_stamp_us``, or no sweep of either lidar.
     """
-    from .lidar import relate_sensors, sweep_to_radar
-    from .oxford import EXTRINSICS, load_sweep
-    from .radar import undistort_points
-
     if twist is not None and mid_stamp_us is None:
         raise ValueError("a twist needs mid_stamp_us, the time to move the points to")
-    stamps = {"velodyne_left": left_stamp, "velodyne_right": right_stamp}
+    stamps = {"velodyne_left": left_stamp_us, "velodyne_right": right_stamp_us}
     sweeps = [(sensor, stamp) for sensor, stamp in stamps.items() if stamp is not None]
     if not sweeps:
-        raise ValueError(f"{session.name}: left_stamp and right_stamp are None; one lidar is needed")
+        raise ValueError(f"{session.name}: left_stamp_us and right_stamp_us are None; one lidar is needed")
     clouds = []
     for sensor, stamp in sweeps:
         points, stamps_us = load_sweep(session, sensor, int(stamp))
         points = sweep_to_radar(points, relate_sensors(EXTRINSICS["radar"], EXTRINSICS[sensor]))
         if twist is not None:
-            points[:, :3] = undistort_points(points[:, :3], (stamps_us - int(mid_stamp_us)) / 1e6, twist)
+            points[:, :3] = deskew_points(points[:, :3], (stamps_us - int(mid_stamp_us)) / 1e6, twist)
         clouds.append(points)
     return np.concatenate(clouds)
 
 
+def radar_to_image(
+    power: np.ndarray,
+    azimuths: np.ndarray,
+    twist: np.ndarray | Sequence[float] | None,
+    settings: PairSettings,
+) -> np.ndarray:
+    """Resample a polar scan into the radar image of a pair.
+
+    Parameters
+    ----------
+    power, azimuths : array, shape (a, b) and (a,)
+        The scan, as in `rol.radar.polar_to_cartesian`.
+    twist : array-like, shape (3,), or None
+        Body velocity [m/s, m/s, rad/s], used with motion "corrected".
+    settings : PairSettings
+        Settings of the image.
+
+    Returns
+    -------
+    image : array, shape (width, width), uint8
+        Power 0..255.
+
+    Raises
+    ------
+    ValueError
+        If the motion is "corrected" and there is no twist.
+    """
+    if settings.motion == "corrected" and twist is None:
+        raise ValueError("motion 'corrected' needs a twist")
+    motion = ScanMotion(twist, doppler_seconds=settings.doppler_seconds)
+    image = polar_to_cartesian(
+        power,
+        azimuths,
+        calibration=RangeCalibration(settings.range_resolution, settings.range_offset),
+        pixel_size=settings.pixel_size,
+        width=settings.width,
+        motion=motion if settings.motion == "corrected" else None,
+    )
+    return np.rint(image * 255.0).astype(np.uint8)
+
+
 def build_pair(
-    session: Any,
-    radar_stamp: int,
-    left_stamp: int | None,
-    right_stamp: int | None,
-    *,
-    motion: str = "none",
-    mid_stamp_us: int | None = None,
-    twist: np.ndarray | Sequence[float] | None = None,
-    range_resolution: float = 0.0438,
-    range_offset: float = -0.31,
-    doppler_seconds: float = 0.049,
-    min_height: float = -1.5,
-    max_range: float = 64.0,
-    width: int = 512,
-    pixel_size: float = 0.25,
+    session: Session, aligned: AlignedScan, settings: PairSettings | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
     """Build the aligned radar and lidar image of one scan.
 
     Parameters
     ----------
-    session : rol.oxford.Session
+    session : Session
         The session.
-    radar_stamp, left_stamp, right_stamp : int
-        Stamps of the scan and of its two sweeps [us]; None for a lidar that the session does not have.
-    motion : str
-        "none" takes scan and sweeps as they are; "corrected" brings both to mid-scan, the scan with its
-        Doppler shift taken out.
-    mid_stamp_us : int, optional
-        Time of mid-scan [us]; 125 ms after the scan's stamp if not given.
-    twist : array-like, shape (3,), optional
-        Body velocity of the radar [m/s, m/s, rad/s]; "corrected" needs it.
-    range_resolution, range_offset, doppler_seconds : float
-        As in `rol.radar.polar_to_cartesian`.
-    min_height, max_range : float
-        Lowest z and largest range of the lidar points kept, in the radar frame [m].
-    width, pixel_size : int, float
-        Pixels along an edge, and the edge of a pixel [m].
+    aligned : AlignedScan
+        The scan and its sweeps.
+    settings : PairSettings, optional
+        Settings of the images; the defaults if not given.
 
     Returns
     -------
     radar_image, lidar_image : array, shape (width, width), uint8
         Power 0..255, and occupancy 0 or 255.
 
+    Raises
+    ------
+    ValueError
+        If the motion is "corrected" and there is no twist.
+
     Notes
     -----
-    Yin et al. 2020, Sec. III-A; the paper corrects no motion ("none").
+    Yin et al. 2020, Sec. III-A; the paper does not compensate motion ("none").
     """
-    from .bev import points_to_image
-    from .lidar import crop_range, remove_ground
-    from .oxford import load_radar
-    from .radar import polar_to_cartesian
-
-    if motion not in ("none", "corrected"):
-        raise ValueError(f"motion must be 'none' or 'corrected', not {motion!r}")
-    if motion == "corrected" and twist is None:
-        raise ValueError("motion 'corrected' needs a twist")
-    twist = twist if motion == "corrected" else None
-    mid_stamp_us = int(radar_stamp) + 125_000 if mid_stamp_us is None else int(mid_stamp_us)
-    scan = load_radar(session.radar_path(int(radar_stamp)))
-    power = polar_to_cartesian(
-        scan.codes,
-        scan.azimuths,
-        range_resolution=range_resolution,
-        range_offset=range_offset,
-        pixel_size=pixel_size,
-        width=width,
-        twist=twist,
-        doppler_seconds=doppler_seconds,
-    )
-    points = load_lidar_points(session, left_stamp, right_stamp, mid_stamp_us=mid_stamp_us, twist=twist)
-    points = crop_range(remove_ground(points, min_height), max_range)
-    lidar_image = points_to_image(points, width=width, pixel_size=pixel_size, max_range=max_range)
-    return np.rint(power * 255.0).astype(np.uint8), lidar_image
+    settings = settings or PairSettings()
+    scan = load_radar(session.radar_path(aligned.radar_stamp_us))
+    radar_image = radar_to_image(scan.power, scan.azimuths, aligned.twist, settings)
+    mid_us = aligned.radar_stamp_us + 125_000 if aligned.mid_stamp_us is None else aligned.mid_stamp_us
+    twist = aligned.twist if settings.motion == "corrected" else None
+    sweeps = aligned.left_stamp_us, aligned.right_stamp_us
+    points = load_lidar_points(session, *sweeps, mid_stamp_us=mid_us, twist=twist)
+    points = crop_range(remove_ground(points, settings.min_height), settings.max_range)
+    size = {name: getattr(settings, name) for name in ("width", "pixel_size", "max_range")}
+    return radar_image, points_to_image(points, **size)
 
 
-def save_pair(folder: str | Path, stamp_us: int, radar_image: np.ndarray, lidar_image: np.ndarray) -> None:
-    """Write both images of a pair as PNG, each whole or not at all.
+# ---- folders of images ----
+
+
+def pair_folder(folder: str | Path) -> ImageFolder:
+    """Return the folder of the pairs of one session."""
+    return ImageFolder(folder, "pairs.json", SIDES)
+
+
+def generated_folder(folder: str | Path) -> ImageFolder:
+    """Return the folder of the generated lidar images of one session."""
+    return ImageFolder(folder, "fake.json")
+
+
+def save_image(path: str | Path, image: np.ndarray) -> None:
+    """Write a grey image (h, w), uint8, as PNG, whole or not at all."""
+    if image.dtype != np.uint8 or image.ndim != 2:
+        raise ValueError(f"{path}: expected a uint8 image (h, w), got {image.dtype} {image.shape}")
+    write_bytes(path, cv2.imencode(".png", image)[1].tobytes())
+
+
+def read_image(path: str | Path) -> np.ndarray:
+    """Read a grey PNG.
 
     Parameters
     ----------
-    folder : path
-        Folder of the pairs of one session.
-    stamp_us : int
-        Stamp of the radar scan [us].
-    radar_image, lidar_image : array, shape (h, w), uint8
-        The images.
+    path : path
+        The file.
+
+    Returns
+    -------
+    image : array, shape (h, w), uint8
+        The image.
+
+    Raises
+    ------
+    ValueError
+        If the file is missing or holds no grey image of 8 bits; the message names it.
     """
+    path = Path(path)
+    if not path.is_file():
+        raise ValueError(f"{path}: the image is missing")
+    data = np.frombuffer(path.read_bytes(), dtype=np.uint8)
+    image = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if len(data) else None
+    if image is None or image.ndim != 2 or image.dtype != np.uint8:
+        raise ValueError(f"{path}: not a readable grey image of 8 bits")
+    return image
+
+
+def save_pair(folder: str | Path, stamp_us: int, radar_image: np.ndarray, lidar_image: np.ndarray) -> None:
+    """Write both images (h, w), uint8, of the pair of a radar stamp [us] into a folder of pairs."""
     for side, image in zip(SIDES, (radar_image, lidar_image), strict=True):
-        path = _image_path(folder, side, stamp_us)
-        if image.dtype != np.uint8 or image.ndim != 2:
-            raise ValueError(f"{path}: expected a uint8 image (h, w), got {image.dtype} {image.shape}")
-        write_bytes(path, cv2.imencode(".png", image)[1].tobytes())
+        save_image(pair_folder(folder).path(stamp_us, side), image)
 
 
 def load_pair(folder: str | Path, stamp_us: int) -> tuple[np.ndarray, np.ndarray]:
@@ -294,102 +546,66 @@ def load_pair(folder: str | Path, stamp_us: int) -> tuple[np.ndarray, np.ndarray
     ValueError
         If a file is missing or no image, or if the two differ in size; the message names the file.
     """
-    images = []
-    for side in SIDES:
-        path = _image_path(folder, side, stamp_us)
-        if not path.is_file():
-            raise ValueError(f"{path}: the {side} image of this pair is missing")
-        data = np.frombuffer(path.read_bytes(), dtype=np.uint8)
-        image = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if len(data) else None
-        if image is None or image.ndim != 2 or image.dtype != np.uint8:
-            raise ValueError(f"{path}: not a readable grey image of 8 bits")
-        images.append(image)
-    if images[0].shape != images[1].shape:
-        raise ValueError(f"{path}: lidar image {images[1].shape}, radar image {images[0].shape}")
-    return images[0], images[1]
+    paths = [pair_folder(folder).path(stamp_us, side) for side in SIDES]
+    radar_image, lidar_image = (read_image(path) for path in paths)
+    if radar_image.shape != lidar_image.shape:
+        raise ValueError(f"{paths[1]}: lidar image {lidar_image.shape}, radar image {radar_image.shape}")
+    return radar_image, lidar_image
 
 
-def describe_pairs(session: Any, alignment_path: str | Path, settings: dict[str, Any]) -> dict[str, Any]:
-    """Put down everything that the pairs of a session depend on.
+def describe_pairs(session: Session, alignment_path: str | Path, settings: PairSettings) -> dict[str, Any]:
+    """Collect everything that the pairs of a session depend on.
 
     Parameters
     ----------
-    session : rol.oxford.Session
+    session : Session
         The session.
     alignment_path : path
         Its ``alignment.csv``.
-    settings : dict
-        Arguments of `build_pair` that are the same for all pairs.
+    settings : PairSettings
+        Settings of the images.
 
     Returns
     -------
     description : dict
-        The settings, the session's name, and digests of ``session.json`` (where there is one), of the
-        alignment and of the code; JSON values only.
+        The settings, `FORMAT`, the session's name, and digests of the alignment and of ``session.json`` (where there
+        is one); JSON values only.
     """
-    rooms = [Path(__file__).with_name(f"{name}.py") for name in ("oxford", "radar", "lidar", "bev", "pairs")]
-    files = {"made": [session.root / "session.json"], "alignment": [Path(alignment_path)], "code": rooms}
-    digests = {}
-    for name, paths in files.items():
-        data = b"".join(path.read_bytes() for path in paths if path.is_file())
+    files, digests = {"made": session.root / "session.json", "alignment": Path(alignment_path)}, {}
+    for name, path in files.items():
+        data = path.read_bytes() if path.is_file() else b""
         digests[f"{name}_digest"] = hashlib.sha256(data).hexdigest()[:16]
-    return {**settings, "session": session.name, **digests}
-
-
-def prepare_pairs(folder: str | Path, settings: dict[str, Any]) -> set[int]:
-    """Prepare a folder for pairs of these settings and list those it already holds.
-
-    Pairs made with other settings are removed.
-
-    Parameters
-    ----------
-    folder : path
-        Folder of the pairs of one session; made if absent.
-    settings : dict
-        Everything the images depend on, JSON values only.
-
-    Returns
-    -------
-    stamps_us : set of int
-        Radar stamps of pairs that are complete [us].
-
-    Raises
-    ------
-    ValueError
-        If the folder is not empty and was not prepared by this function; nothing is removed.
-    """
-    return prepare_images(folder, settings, SIDES, "pairs.json")
+    return {**asdict(settings), "format": FORMAT, "session": session.name, **digests}
 
 
 def write_pairs(
-    session: Any,
+    session: Session,
     folder: str | Path,
-    jobs: Sequence[dict[str, Any]],
-    settings: dict[str, Any],
+    aligned: Sequence[AlignedScan],
+    settings: PairSettings | None = None,
     workers: int = 1,
 ) -> Iterator[int]:
-    """Build and save pairs one after the other, or in several processes.
+    """Build and save pairs, in several processes if asked for.
 
     Parameters
     ----------
-    session : rol.oxford.Session
+    session : Session
         The session.
     folder : path
         Folder of its pairs.
-    jobs : sequence of dict
-        Per pair ``radar_stamp``, ``left_stamp``, ``right_stamp`` and what else of `build_pair` changes from
-        pair to pair.
-    settings : dict
-        Arguments of `build_pair` that are the same for all.
+    aligned : sequence of AlignedScan
+        The scans.
+    settings : PairSettings, optional
+        Settings of the images; the defaults if not given.
     workers : int
         Processes.
 
     Yields
     ------
     stamp_us : int
-        Radar stamp of each pair written, in the order of the jobs [us].
+        Radar stamp of each pair written, in the order of the scans [us].
     """
-    tasks = ((session, folder, {**settings, **job}) for job in jobs)
+    tasks = ((session, folder, one, settings) for one in aligned)
     if workers <= 1:
         yield from map(_write_one, tasks)
         return
@@ -397,30 +613,8 @@ def write_pairs(
         yield from pool.map(_write_one, tasks, chunksize=4)
 
 
-def finish_pairs(folder: str | Path, settings: dict[str, Any], stamps_us: Sequence[int]) -> None:
-    """Write ``pairs.json``, which makes a folder of pairs whole; every pair must be there.
-
-    Parameters
-    ----------
-    folder : path
-        Folder of the pairs of one session.
-    settings : dict
-        As given to `prepare_pairs`.
-    stamps_us : sequence of int
-        Radar stamps in the order of time [us].
-    """
-    for stamp in stamps_us:
-        for side in SIDES:
-            if not _image_path(folder, side, stamp).is_file():
-                raise ValueError(f"{_image_path(folder, side, stamp)}: missing, the pairs are not complete")
-    text = json.dumps(
-        {"settings": settings, "stamps_us": [int(s) for s in stamps_us]}, indent=1, sort_keys=True
-    )
-    write_text(Path(folder) / "pairs.json", text)
-
-
 def list_pairs(folder: str | Path) -> list[int]:
-    """List the radar stamps of a complete folder of pairs.
+    """List the radar stamps of a complete folder of pairs, see `rol.files.ImageFolder.read`.
 
     Parameters
     ----------
@@ -431,19 +625,43 @@ def list_pairs(folder: str | Path) -> list[int]:
     -------
     stamps_us : list of int
         Radar stamps in the order of time [us].
+    """
+    return pair_folder(folder).read()["stamps_us"]
+
+
+def read_points(
+    folder: str | Path, stamps_us: Sequence[int], twists: Sequence[Sequence[float]] | None = None
+) -> Iterator[np.ndarray]:
+    """Read the generated points of scans, one scan after the other.
+
+    Parameters
+    ----------
+    folder : path
+        Complete folder of the generated images of one session. Its ``fake.json`` holds under ``points`` the arguments
+        of `rol.bev.image_to_points`.
+    stamps_us : sequence of int
+        Radar stamps of the scans [us].
+    twists : sequence of (vx, vy, yaw rate), optional
+        Body velocity in each scan [m/s, m/s, rad/s]. With it points are moved to mid-scan, see
+        `rol.radar.compensate_points`; points of motion-compensated images are left where they are.
+
+    Yields
+    ------
+    points : array, shape (n, 2)
+        Points in the radar frame [m].
 
     Raises
     ------
     ValueError
-        If ``pairs.json`` is missing or broken; the message names it.
+        If the folder is not complete or an image cannot be read; the message names the file.
     """
-    path = Path(folder) / "pairs.json"
-    if not path.is_file():
-        raise ValueError(f"{path}: missing; chapter 03 writes it when all pairs of the session are there")
-    try:
-        return [int(stamp) for stamp in json.loads(read_text(path))["stamps_us"]]
-    except (ValueError, KeyError, TypeError) as error:
-        raise ValueError(f"{path}: not a list of pairs ({error})") from error
+    images = generated_folder(folder)
+    about = images.read()
+    if twists is None or about["settings"].get("pairs", {}).get("motion") == "corrected":
+        twists = [None] * len(stamps_us)
+    for stamp, twist in zip(stamps_us, twists, strict=True):
+        points = image_to_points(read_image(images.path(stamp)), **about["points"])
+        yield points if twist is None else compensate_points(points, ScanMotion(twist))
 
 
 class PairDataset:
@@ -468,23 +686,24 @@ class PairDataset:
         return len(self.stamps_us)
 
     def name(self, index: int) -> str:
-        """Name the radar image of a pair."""
-        return str(_image_path(self.folder, "radar", self.stamps_us[index]))
+        """Return the path of the radar image of a pair."""
+        return str(pair_folder(self.folder).path(self.stamps_us[index], "radar"))
 
     def __getitem__(self, index: int) -> tuple[np.ndarray, np.ndarray]:
-        """Give radar and lidar image, float32 (1, h, w), -1 for code 0 and +1 for code 255."""
-        images = load_pair(self.folder, self.stamps_us[index])
+        """Return radar and lidar image, float32 (1, h, w), -1 for grey value 0 and +1 for 255."""
         radar, lidar = (
-            image[None].astype(np.float32) / np.float32(127.5) - np.float32(1.0) for image in images
+            normalize_image(image[None]) for image in load_pair(self.folder, self.stamps_us[index])
         )
         return radar, lidar
 
 
-def _write_one(task: tuple[Any, str | Path, dict[str, Any]]) -> int:
-    session, folder, arguments = task
-    save_pair(folder, arguments["radar_stamp"], *build_pair(session, **arguments))
-    return int(arguments["radar_stamp"])
+def _write_one(task: tuple[Session, str | Path, AlignedScan, PairSettings | None]) -> int:
+    session, folder, aligned, settings = task
+    save_pair(folder, aligned.radar_stamp_us, *build_pair(session, aligned, settings))
+    return aligned.radar_stamp_us
 
 
-def _image_path(folder: str | Path, side: str, stamp_us: int) -> Path:
-    return Path(folder) / side / f"{int(stamp_us)}.png"
+def _check_motion(motion: str) -> None:
+    """Check the name of a treatment of motion."""
+    if motion not in MOTIONS:
+        raise ValueError(f"motion must be 'none' or 'corrected', not {motion!r}")

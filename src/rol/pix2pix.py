@@ -1,24 +1,24 @@
-"""The translator room: the networks of pix2pix, their losses, one training step, use, weights as files.
+"""Networks of pix2pix and their losses, one training step, image generation, and weights as files.
 
 Images are tensors of shape (b, 1, h, w) in [-1, 1]: -1 is empty (pixel 0), +1 is occupied (pixel 255). Row 0
-is the farthest forward, column 0 the farthest left. The architecture is that of the public pix2pix and
-CycleGAN code with one channel in and one channel out (Yin et al. 2020, Sec. III-A, Eq. 2-5, and Sec. IV-A).
-Only this room and `rol.unet` import torch when they are imported; `rol.training` holds the loop.
+is the farthest forward, column 0 the farthest left. The networks are those of the public pix2pix and CycleGAN
+code with one input and one output channel (Yin et al. 2020, Sec. III-A, Eq. 2-5, and Sec. IV-A).
+`rol.training` holds the training loop.
 
-Batch norm takes the statistics of the images it is given, in training and in use alike, and keeps no running
-ones. The public code does so too when it is used as its authors use it, and with one image per batch the
-network is then one and the same function in training and in use. So `generate` handles one image at a time.
-There is no dropout: nothing is drawn after the first weights but the order of the pairs.
+Batch norm uses the statistics of its input, in training and in inference, and keeps no running statistics. The
+public code does the same as its authors use it. With one image per batch, the network is then the same function
+in training and in inference, so `generate` processes one image at a time. There is no dropout: only the initial
+weights and the order of the pairs are random.
 """
 
 from __future__ import annotations
 
 import json
 import math
-from contextlib import AbstractContextManager, nullcontext
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
@@ -28,19 +28,13 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 try:
+    from .bev import normalize_image
     from .files import write_bytes
     from .geometry import check_fields
 except ImportError:  # this file was copied on its own
+    from bev import normalize_image
     from files import write_bytes
     from geometry import check_fields
-
-if TYPE_CHECKING:
-    from .unet import UnetGenerator
-
-ARCHITECTURES = {
-    "resnet": "resnet-generator, batch statistics, 1 to 1 channel",
-    "unet": "folded u-net, running statistics, 1 to 1 channel",
-}
 
 
 class Pix2PixError(ValueError):
@@ -49,54 +43,91 @@ class Pix2PixError(ValueError):
 
 @dataclass(frozen=True)
 class TrainConfig:
-    """Settings of one training run; the defaults are the paper's, or the public code's where it is silent."""
+    """Settings of a training run; the defaults are the paper's, or the public code's where it gives none."""
 
-    network: str = "resnet"  # the paper's; "unet": `rol.unet`, smaller and quicker
-    filters: int = 64  # width of the generator's first layer; public default
-    blocks: int = 9  # residual blocks; Sec. IV-A, "ResNet with 9 blocks"
-    discriminator_filters: int = 64  # width of the discriminator's first layer; public default
-    epochs: int = 200  # passes over the pairs, half at full rate and half decaying; public default 100 + 100
-    steps: int = (
-        0  # 0: as many as the epochs need; otherwise this many optimiser steps and `epochs` is not read
-    )
-    batch: int = 1  # public default; batch statistics are then those of one image, as in use
+    ngf: int = 64  # width of the generator's first layer; public default
+    n_blocks: int = 9  # residual blocks; Sec. IV-A, "ResNet with 9 blocks"
+    ndf: int = 64  # width of the discriminator's first layer; public default
+    epochs: int = 200  # passes over the pairs; public default 100 at constant rate + 100 decaying
+    steps: int = 0  # optimizer steps; 0: as many as `epochs` needs
+    batch_size: int = 1  # public default; batch statistics are then those of one image, as in inference
     lambda_l1: float = 100.0  # lambda of Eq. 2; the paper gives no value, public default
-    gan_weight: float = 1.0  # of Eq. 3 in Eq. 2; 0: no discriminator, the pixels' loss alone
-    pixel_loss: str = (
-        "l1"  # "l1": Eq. 4; "entropy": how surprised the image is, as if grey were a probability
-    )
-    occupied_weight: float = 1.0  # 1: Eq. 4 as printed; above 1, an occupied pixel counts so many times
-    rotate: bool = False  # True: every pair in a heading drawn anew; the paper does not
-    gain_spread_db: float = 0.0  # spread of a gain drawn anew for every scan; the paper has none
-    streaks: float = (
-        0.0  # bright streaks added to a scan on average, see `rol.scan_pairs`; the paper adds none
-    )
-    ghosts: float = 0.0  # echoes that appear a second time elsewhere, on average; the paper adds none
     learning_rate: float = 2e-4  # Adam; public default
-    beta1: float = (
-        0.5  # Adam; public default, lower than Adam's own 0.9 because the two losses chase each other
-    )
-    beta2: float = 0.999  # Adam; public default
-    bf16: bool = (
-        False  # True: multiply in bfloat16; quicker only where the processor or GPU has such instructions
-    )
-    report_every: int = 50  # steps per row of the history, each with a look at the held-out pairs
-    checkpoint_every: int = 500  # steps between checkpoints, a multiple of the above: minutes lost at most
+    beta1: float = 0.5  # Adam; public default
+    bf16: bool = False  # True: compute in bfloat16; quicker only where there are instructions for it
+    report_every: int = 50  # steps per row of the history, each with an evaluation of the held-out pairs
+    checkpoint_every: int = 500  # steps between checkpoints, a multiple of `report_every`
 
     def __post_init__(self) -> None:
         allowed = {
-            tuple(ARCHITECTURES): "network",
-            ("l1", "entropy"): "pixel_loss",
-            "[1, inf)": "filters discriminator_filters epochs batch report_every checkpoint_every",
-            "[0, inf)": "blocks steps lambda_l1 gan_weight gain_spread_db streaks ghosts",
-            "(0, inf)": "occupied_weight learning_rate",
-            "[0, 1)": "beta1 beta2",
+            "[1, inf)": "ngf ndf epochs batch_size report_every checkpoint_every",
+            "[0, inf)": "n_blocks steps lambda_l1",
+            "(0, inf)": "learning_rate",
+            "[0, 1)": "beta1",
         }
         check_fields(self, allowed, Pix2PixError)
 
     def n_steps(self, n_pairs: int) -> int:
-        """Give the number of optimiser steps for a data set of `n_pairs` pairs."""
-        return self.steps or self.epochs * -(-n_pairs // self.batch)
+        """Compute the number of optimizer steps for a data set of `n_pairs` pairs."""
+        return self.steps or self.epochs * -(-n_pairs // self.batch_size)
+
+
+class Generator(nn.Module):
+    """Base class of the generators G: radar images to lidar images, shape (b, 1, h, w) in [-1, 1].
+
+    Attributes
+    ----------
+    architecture, description : str
+        Name for `build_generator`, and the words in the header of a weights file.
+    size_step : int
+        Height and width must be multiples of it [pixels].
+    ngf, n_blocks : int
+        Width of the first layer and number of residual blocks.
+    image_size : tuple of int or None
+        Height and width it was trained on; `generate` refuses any other. None: not trained yet.
+    tta_rotations : int
+        Quarter turns of the image that `generate` averages, 1 to 4 (test-time augmentation); kept with the
+        weights. The paper takes one.
+    """
+
+    architecture, description, size_step = "", "", 4
+
+    def __init__(self, ngf: int, n_blocks: int) -> None:
+        super().__init__()
+        self.ngf, self.n_blocks, self.tta_rotations = ngf, n_blocks, 1
+        self.image_size: tuple[int, int] | None = None
+
+    def logits(self, radar: Tensor) -> Tensor:
+        """Compute the generated images before the tanh: half the log-odds of an occupied pixel."""
+        raise NotImplementedError
+
+    def forward(self, radar: Tensor) -> Tensor:
+        """Generate lidar images from radar images."""
+        return torch.tanh(self.logits(radar))  # (b, 1, h, w) -> (b, 1, h, w)
+
+    def fuse(self) -> None:
+        """Merge norms with running statistics into convolutions, for inference; without them do nothing."""
+
+
+ARCHITECTURES: dict[str, type[Generator]] = {}
+# Modules that register an architecture when they are imported, by its name and by its description.
+REGISTERED_BY = dict.fromkeys(("unet", "folded u-net, running statistics, 1 to 1 channel"), "rol_beyond.unet")
+
+
+def register_architecture(network: type[Generator]) -> type[Generator]:
+    """Make an architecture known to `build_generator` and `load_weights`; a decorator of its class."""
+    ARCHITECTURES[network.architecture] = network
+    return network
+
+
+def _find_architecture(key: Any) -> type[Generator]:
+    """Find an architecture by its name or its description."""
+    for network in ARCHITECTURES.values():
+        if key in (network.architecture, network.description):
+            return network
+    if str(key) in REGISTERED_BY:
+        raise Pix2PixError(f"architecture {key!r} is not registered: `import {REGISTERED_BY[key]}` first")
+    raise Pix2PixError(f"architecture {key!r} is none of {', '.join(ARCHITECTURES)}")
 
 
 def _norm(channels: int) -> nn.BatchNorm2d:
@@ -104,7 +135,7 @@ def _norm(channels: int) -> nn.BatchNorm2d:
 
 
 class _ReflectionPad2d(nn.ReflectionPad2d):
-    """Reflection padding that keeps bfloat16: autocast would pad in float32, which only costs time."""
+    """Reflection padding that keeps bfloat16: autocast would pad in float32, which is slower."""
 
     def forward(self, x: Tensor) -> Tensor:
         with torch.autocast(x.device.type, enabled=False):
@@ -123,56 +154,35 @@ class ResidualBlock(nn.Module):
         self.layers = nn.Sequential(*layers)
 
     def forward(self, x: Tensor) -> Tensor:
-        """Return the input plus what the block has learnt to add."""
+        """Add the output of the two convolutions to the input."""
         return x + self.layers(x)  # (b, c, h, w)
 
 
-class ResnetGenerator(nn.Module):
-    """Generator G: 7 x 7, two halvings, residual blocks, two doublings, 7 x 7, tanh.
+@register_architecture
+class ResnetGenerator(Generator):
+    """The paper's generator: 7 x 7, two halvings, residual blocks, two doublings, 7 x 7, tanh."""
 
-    Attributes
-    ----------
-    filters, blocks : int
-        Width of the first layer and number of residual blocks.
-    image_size : tuple of int or None
-        Height and width it was trained on; ``generate`` refuses any other. None: not trained yet.
-    headings : int
-        Quarter turns of an image that ``generate`` averages, 1 to 4; kept with the weights. The paper takes one.
-    """
+    architecture, description = "resnet", "resnet-generator, batch statistics, 1 to 1 channel"
 
-    size_step = 4  # height and width must be multiples of it
-    headings = 1
-
-    def __init__(self, filters: int, blocks: int) -> None:
-        super().__init__()
-        self.filters, self.blocks, self.image_size = filters, blocks, None
-        f = filters
-        layers: list[nn.Module] = [
-            _ReflectionPad2d(3),
-            nn.Conv2d(1, f, 7, bias=False),
-            _norm(f),
-            nn.ReLU(True),
-        ]
-        for c in (f, 2 * f):
+    def __init__(self, ngf: int, n_blocks: int) -> None:
+        super().__init__(ngf, n_blocks)
+        layers = [_ReflectionPad2d(3), nn.Conv2d(1, ngf, 7, bias=False), _norm(ngf), nn.ReLU(True)]
+        for c in (ngf, 2 * ngf):
             layers += [nn.Conv2d(c, 2 * c, 3, stride=2, padding=1, bias=False), _norm(2 * c), nn.ReLU(True)]
-        layers += [ResidualBlock(4 * f) for _ in range(blocks)]
-        for c in (4 * f, 2 * f):
+        layers += [ResidualBlock(4 * ngf) for _ in range(n_blocks)]
+        for c in (4 * ngf, 2 * ngf):
             up = nn.ConvTranspose2d(c, c // 2, 3, stride=2, padding=1, output_padding=1, bias=False)
             layers += [up, _norm(c // 2), nn.ReLU(True)]
-        layers += [_ReflectionPad2d(3), nn.Conv2d(f, 1, 7), nn.Tanh()]
+        layers += [_ReflectionPad2d(3), nn.Conv2d(ngf, 1, 7), nn.Tanh()]
         self.layers = nn.Sequential(*layers)
 
     def logits(self, radar: Tensor) -> Tensor:
-        """Map radar images to fake lidar images before the tanh: half the log-odds of an occupied pixel."""
+        """Compute the generated images before the tanh: half the log-odds of an occupied pixel."""
         return self.layers[:-1](radar).float()  # (b, 1, h, w) -> (b, 1, h, w)
-
-    def forward(self, radar: Tensor) -> Tensor:
-        """Map radar images to fake lidar images."""
-        return torch.tanh(self.logits(radar))  # (b, 1, h, w) -> (b, 1, h, w)
 
 
 def _initialise(network: nn.Module, rng: torch.Generator) -> nn.Module:
-    """Fill a network built on the meta device with pix2pix's first weights, drawn from `rng` alone."""
+    """Initialize a network built on the meta device as pix2pix does, with `rng` as the only source."""
     network.to_empty(device="cpu")
     for module in network.modules():
         if isinstance(module, nn.Conv2d | nn.ConvTranspose2d | nn.BatchNorm2d):
@@ -186,52 +196,47 @@ def _initialise(network: nn.Module, rng: torch.Generator) -> nn.Module:
 
 
 def build_generator(
-    filters: int = 64, blocks: int = 9, network: str = "resnet", *, rng: torch.Generator
-) -> ResnetGenerator | UnetGenerator:
-    """Build the generator with freshly drawn weights.
+    ngf: int = 64, n_blocks: int = 9, architecture: str = "resnet", *, rng: torch.Generator
+) -> Generator:
+    """Build a generator with random initial weights.
 
     Parameters
     ----------
-    filters : int
-        Width of the first layer; 64 is the paper's, the cost grows with its square.
-    blocks : int
+    ngf : int
+        Width of the first layer; 64 in the public code. The cost grows with its square.
+    n_blocks : int
         Residual blocks; 9 in the paper.
-    network : str
-        "resnet", the paper's, or "unet", see `rol.unet`.
+    architecture : str
+        "resnet", the paper's, or another registered one, see `register_architecture`.
     rng : torch.Generator
         Source of the weights, N(0, 0.02) as in pix2pix.
 
     Returns
     -------
-    generator : ResnetGenerator or UnetGenerator
+    generator : Generator
         Maps (b, 1, h, w) to (b, 1, h, w), both in [-1, 1]; h and w must be multiples of its `size_step`.
 
     Raises
     ------
     Pix2PixError
-        If there is no such network, or not of this width and depth.
+        If the architecture is not registered, or cannot have this width and depth.
     """
-    if network not in ARCHITECTURES:
-        raise Pix2PixError(f"network: {network!r} is none of {', '.join(ARCHITECTURES)}")
-    if filters < 1 or blocks < 0:
+    network = _find_architecture(architecture)
+    if ngf < 1 or n_blocks < 0:
         raise Pix2PixError(
-            f"generator: filters must be at least 1 and blocks at least 0, got {filters}, {blocks}"
+            f"generator: ngf must be at least 1 and n_blocks at least 0, got {ngf}, {n_blocks}"
         )
-    if network == "unet":
-        from .unet import UnetGenerator as Network
-    else:
-        Network = ResnetGenerator
     with torch.device("meta"):  # no weights drawn from torch's global state
-        built = Network(filters, blocks)
+        built = network(ngf, n_blocks)
     return _initialise(built, rng)
 
 
-def build_discriminator(filters: int = 64, *, rng: torch.Generator) -> nn.Sequential:
-    """Build the 70 x 70 PatchGAN discriminator with freshly drawn weights.
+def build_discriminator(ndf: int = 64, *, rng: torch.Generator) -> nn.Sequential:
+    """Build the 70 x 70 PatchGAN discriminator with random initial weights.
 
     Parameters
     ----------
-    filters : int
+    ndf : int
         Width of the first layer.
     rng : torch.Generator
         Source of the weights, N(0, 0.02) as in pix2pix.
@@ -242,30 +247,29 @@ def build_discriminator(filters: int = 64, *, rng: torch.Generator) -> nn.Sequen
         Maps radar and lidar image stacked (b, 2, h, w) to one logit per patch of 70 x 70 pixels,
         (b, 1, h / 8 - 2, w / 8 - 2).
     """
-    f = filters
     with torch.device("meta"):
-        layers: list[nn.Module] = [nn.Conv2d(2, f, 4, stride=2, padding=1), nn.LeakyReLU(0.2, True)]
-        for c, stride in ((f, 2), (2 * f, 2), (4 * f, 1)):
+        layers: list[nn.Module] = [nn.Conv2d(2, ndf, 4, stride=2, padding=1), nn.LeakyReLU(0.2, True)]
+        for c, stride in ((ndf, 2), (2 * ndf, 2), (4 * ndf, 1)):
             layers += [nn.Conv2d(c, 2 * c, 4, stride, 1, bias=False), _norm(2 * c), nn.LeakyReLU(0.2, True)]
-        network = nn.Sequential(*layers, nn.Conv2d(8 * f, 1, 4, stride=1, padding=1))
+        network = nn.Sequential(*layers, nn.Conv2d(8 * ndf, 1, 4, stride=1, padding=1))
     return _initialise(network, rng)
 
 
 def receptive_field(network: nn.Module) -> int:
-    """Work out how many pixels of the input, along an edge, one output of a chain of convolutions sees.
+    """Compute the receptive field of one output of a sequence of convolutions.
 
     Parameters
     ----------
     network : torch.nn.Module
-        Convolutions one after the other, none of them transposed; what lies between them is not counted, so
-        not the statistics of batch norm, which come from the whole image.
+        Convolutions in sequence, none of them transposed. Other layers are not counted, so neither are the
+        statistics of batch norm, which depend on the whole image.
 
     Returns
     -------
     size : int
         Edge of the receptive field [pixels]; 70 for `build_discriminator`.
     """
-    size, jump = 1, 1  # pixels seen by one output, and pixels between two neighbouring outputs
+    size, jump = 1, 1  # receptive field, and distance between two neighbouring outputs [pixels]
     for module in network.modules():
         if isinstance(module, nn.Conv2d):
             size += (module.kernel_size[0] - 1) * jump
@@ -274,14 +278,14 @@ def receptive_field(network: nn.Module) -> int:
 
 
 def gan_loss(logits: Tensor, is_real: bool) -> Tensor:
-    """Score logits against one answer for all patches: binary cross-entropy, one term of Eq. 3.
+    """Compute the binary cross-entropy of a discriminator's output, one term of Eq. 3.
 
     Parameters
     ----------
     logits : tensor, any shape
-        What the discriminator says before the sigmoid.
+        Output of the discriminator before the sigmoid.
     is_real : bool
-        The answer it is held against.
+        Target for all patches.
 
     Returns
     -------
@@ -291,84 +295,53 @@ def gan_loss(logits: Tensor, is_real: bool) -> Tensor:
     return functional.binary_cross_entropy_with_logits(logits, torch.full_like(logits, float(is_real)))
 
 
-def l1_loss(fake: Tensor, lidar: Tensor, occupied_weight: float = 1.0) -> Tensor:
-    """Measure the mean absolute difference of two images, Eq. 4.
+def l1_loss(generated: Tensor, lidar: Tensor) -> Tensor:
+    """Compute the mean absolute difference of generated and lidar image, Eq. 4.
 
     Parameters
     ----------
-    fake, lidar : tensor, shape (b, 1, h, w)
-        Generated and real image in [-1, 1].
-    occupied_weight : float
-        How many times a pixel counts that is occupied in the real image; 1 is the paper's.
+    generated, lidar : tensor, shape (b, 1, h, w)
+        Images in [-1, 1].
 
     Returns
     -------
     loss : tensor, shape ()
-        Mean over all pixels; in [0, 2] for a weight of 1.
+        Mean over all pixels, in [0, 2].
     """
-    return _weigh((fake - lidar).abs(), lidar, occupied_weight)
-
-
-def entropy_loss(logits: Tensor, lidar: Tensor, occupied_weight: float = 1.0) -> Tensor:
-    """Measure how surprising the real image is if the generated grey is a probability: cross-entropy.
-
-    Unlike Eq. 4 it has a slope where the generator is sure and wrong, and its least value is reached by the
-    true probability p of an occupied pixel, or w p / (1 + (w - 1) p) for a weight w. Not in the paper.
-
-    Parameters
-    ----------
-    logits : tensor, shape (b, 1, h, w)
-        Output of `ResnetGenerator.logits`; the image is their tanh, so the log-odds are twice the logits.
-    lidar : tensor, shape (b, 1, h, w)
-        Real image in [-1, 1].
-    occupied_weight : float
-        How many times a pixel counts that is occupied in the real image.
-
-    Returns
-    -------
-    loss : tensor, shape ()
-        Mean over all pixels [nat].
-    """
-    surprise = functional.binary_cross_entropy_with_logits(
-        2.0 * logits, (lidar > 0).to(logits.dtype), reduction="none"
-    )
-    return _weigh(surprise, lidar, occupied_weight)
-
-
-def _weigh(losses: Tensor, lidar: Tensor, occupied_weight: float) -> Tensor:
-    """Mean of losses by pixel, those of occupied pixels counted so many times."""
-    if occupied_weight != 1.0:
-        losses = losses * (1.0 + (occupied_weight - 1.0) * (lidar > 0))
-    return losses.mean()
+    return (generated - lidar).abs().mean()
 
 
 def train_step(
-    generator: ResnetGenerator | UnetGenerator,
-    discriminator: nn.Module | None,
-    optimizer_g: torch.optim.Optimizer,
-    optimizer_d: torch.optim.Optimizer | None,
+    networks: Mapping[str, nn.Module],
+    optimizers: Mapping[str, torch.optim.Optimizer],
     radar: Tensor,
     lidar: Tensor,
-    config: TrainConfig,
+    *,
+    lambda_l1: float = 100.0,
+    pixel_loss: Callable[[Tensor, Tensor, Tensor], Tensor] | None = None,
+    bf16: bool = False,
 ) -> dict[str, float]:
-    """Update the discriminator, then the generator against the frozen discriminator (changes both in place).
+    """Update the discriminator, then the generator against the frozen discriminator, both in place.
 
     Parameters
     ----------
-    generator, discriminator : torch.nn.Module
-        The two networks; no discriminator is needed where `config.gan_weight` is 0.
-    optimizer_g, optimizer_d : torch.optim.Optimizer
-        Their optimisers.
+    networks, optimizers : mapping
+        The "generator" and the "discriminator", and the optimizer of each; without a discriminator the pixel
+        loss alone is minimized.
     radar, lidar : tensor, shape (b, 1, h, w)
         A batch of pairs in [-1, 1].
-    config : TrainConfig
-        Read: `gan_weight`, `pixel_loss`, `lambda_l1`, `occupied_weight`, `bf16`.
+    lambda_l1 : float
+        Lambda of Eq. 2.
+    pixel_loss : callable, optional
+        Replaces Eq. 4; takes the logits of the generated image, the generated image and the lidar image.
+    bf16 : bool
+        Compute in bfloat16 by autocast.
 
     Returns
     -------
     losses : dict of float
         ``loss_d`` (half the sum of its two terms), ``loss_gan``, both nan without a discriminator, and
-        ``loss_l1`` (Eq. 4, without lambda and weight).
+        ``loss_l1`` (Eq. 4, without lambda).
 
     Raises
     ------
@@ -377,63 +350,55 @@ def train_step(
 
     Notes
     -----
-    Yin et al. 2020, Sec. III-A, Eq. 2-4. As in the public code the generator maximises log D(fake) instead of
-    minimising log(1 - D(fake)): the same aim with a stronger slope while the fakes are still poor.
+    Yin et al. 2020, Sec. III-A, Eq. 2-4. As in the public code the generator maximizes log D(G(x)) instead of
+    minimizing log(1 - D(G(x))), which has a larger gradient early in the training.
     """
-    autocast = torch.autocast(radar.device.type, torch.bfloat16) if config.bf16 else nullcontext()
+    generator, discriminator = networks["generator"], networks.get("discriminator")
+    autocast = torch.autocast(radar.device.type, torch.bfloat16, enabled=bf16)
     with autocast:
         logits = generator.logits(radar)  # (b, 1, h, w)
-        fake = torch.tanh(logits)
+        generated = torch.tanh(logits)
     loss_d, loss_gan = torch.tensor(float("nan")), torch.tensor(float("nan"))
-    if discriminator is not None and optimizer_d is not None and config.gan_weight > 0.0:
-        loss_d = _discriminator_loss(
-            discriminator.requires_grad_(True), radar, lidar, fake.detach(), autocast
-        )
-        _descend(optimizer_d, loss_d, "discriminator loss")
+    if discriminator is not None:
+        with autocast:
+            loss_d = _discriminator_loss(discriminator.requires_grad_(True), radar, lidar, generated.detach())
+        _optimizer_step(optimizers["discriminator"], loss_d, "discriminator loss")
         discriminator.requires_grad_(False)
         with autocast:
-            loss_gan = gan_loss(discriminator(torch.cat([radar, fake], 1)).float(), True)
-    weight = config.occupied_weight
-    if config.pixel_loss == "entropy":
-        loss_g = config.lambda_l1 * entropy_loss(logits, lidar, weight)
-    else:
-        loss_g = config.lambda_l1 * l1_loss(fake, lidar, weight)
-    if config.gan_weight > 0.0:
-        loss_g = loss_g + config.gan_weight * loss_gan
-    _descend(optimizer_g, loss_g, "generator loss")
-    losses = {"loss_d": loss_d, "loss_gan": loss_gan, "loss_l1": l1_loss(fake, lidar)}
+            loss_gan = gan_loss(discriminator(torch.cat([radar, generated], 1)).float(), True)
+    loss_pixels = pixel_loss(logits, generated, lidar) if pixel_loss else l1_loss(generated, lidar)
+    loss_g = lambda_l1 * loss_pixels + (0.0 if discriminator is None else loss_gan)
+    _optimizer_step(optimizers["generator"], loss_g, "generator loss")
+    losses = {"loss_d": loss_d, "loss_gan": loss_gan, "loss_l1": l1_loss(generated, lidar)}
     return {name: float(loss.detach()) for name, loss in losses.items()}
 
 
-def _discriminator_loss(
-    discriminator: nn.Module, radar: Tensor, lidar: Tensor, fake: Tensor, autocast: AbstractContextManager
-) -> Tensor:
-    """Eq. 3 for the discriminator, halved as in pix2pix: it learns more slowly than the generator."""
-    with autocast:
-        loss_fake = gan_loss(discriminator(torch.cat([radar, fake], 1)).float(), False)
-        loss_real = gan_loss(discriminator(torch.cat([radar, lidar], 1)).float(), True)
-    return 0.5 * (loss_fake + loss_real)
+def _discriminator_loss(discriminator: nn.Module, radar: Tensor, lidar: Tensor, generated: Tensor) -> Tensor:
+    """Compute Eq. 3 for the discriminator, halved as in pix2pix to slow it down."""
+    loss_generated = gan_loss(discriminator(torch.cat([radar, generated], 1)).float(), False)
+    loss_real = gan_loss(discriminator(torch.cat([radar, lidar], 1)).float(), True)
+    return 0.5 * (loss_generated + loss_real)
 
 
-def _descend(optimizer: torch.optim.Optimizer, loss: Tensor, name: str) -> None:
-    """Take one optimiser step down a loss, or refuse if the loss or a gradient is not finite."""
+def _optimizer_step(optimizer: torch.optim.Optimizer, loss: Tensor, name: str) -> None:
+    """Take one optimizer step, or refuse if the loss or a gradient is not finite."""
     if not torch.isfinite(loss.detach()):
         raise Pix2PixError(f"{name} is {float(loss.detach())}")
     optimizer.zero_grad(set_to_none=True)
     loss.backward()
     weights = [weight for group in optimizer.param_groups for weight in group["params"]]
-    steepness = torch.nn.utils.get_total_norm([w.grad for w in weights if w.grad is not None])
-    if not torch.isfinite(steepness):
-        raise Pix2PixError(f"gradient of the {name} is {float(steepness)}")
+    norm = torch.nn.utils.get_total_norm([w.grad for w in weights if w.grad is not None])
+    if not torch.isfinite(norm):
+        raise Pix2PixError(f"gradient of the {name} is {float(norm)}")
     optimizer.step()
 
 
-def evaluate_l1(generator: ResnetGenerator | UnetGenerator, pairs: Any) -> float:
-    """Measure Eq. 4 on pairs that are not learnt from.
+def evaluate_l1(generator: nn.Module, pairs: Any) -> float:
+    """Evaluate Eq. 4 on held-out pairs.
 
     Parameters
     ----------
-    generator : ResnetGenerator or UnetGenerator
+    generator : torch.nn.Module
         The network.
     pairs : sequence of (radar, lidar), each array float32 (1, h, w) in [-1, 1]
         The pairs.
@@ -454,7 +419,7 @@ def evaluate_l1(generator: ResnetGenerator | UnetGenerator, pairs: Any) -> float
 
 
 def has_bf16(device: str = "cpu") -> bool:
-    """Tell whether a device has instructions for bfloat16; without them it is many times slower than float32."""
+    """Return whether a device has bfloat16 instructions; without them bfloat16 is far slower than float32."""
     if device.startswith("cuda"):
         return torch.cuda.is_available() and torch.cuda.is_bf16_supported()
     tests = (getattr(torch.cpu, f"_is_{name}_supported", None) for name in ("amx_tile", "avx512_bf16"))
@@ -462,7 +427,7 @@ def has_bf16(device: str = "cpu") -> bool:
 
 
 def choose_bf16(bf16: bool | str, device: str = "cpu") -> bool:
-    """Decide whether to multiply in bfloat16.
+    """Decide whether to compute in bfloat16.
 
     Parameters
     ----------
@@ -486,7 +451,7 @@ def choose_bf16(bf16: bool | str, device: str = "cpu") -> bool:
 
 
 def to_tensor(image: np.ndarray) -> Tensor:
-    """Turn a grey image into a tensor: 0 becomes -1, 255 becomes +1.
+    """Convert a grey image to a tensor: 0 becomes -1, 255 becomes +1.
 
     Parameters
     ----------
@@ -498,42 +463,34 @@ def to_tensor(image: np.ndarray) -> Tensor:
     tensor : tensor, shape (1, 1, h, w), float32
         The same in [-1, 1].
     """
-    return torch.from_numpy(image[None, None].astype(np.float32) / np.float32(127.5) - np.float32(1.0))
+    return torch.from_numpy(normalize_image(image[None, None]))
 
 
 def generate(
-    generator: ResnetGenerator | UnetGenerator,
-    radar_image: np.ndarray,
-    *,
-    bf16: bool = False,
-    headings: int | None = None,
+    generator: Generator, radar_image: np.ndarray, *, bf16: bool = False, tta_rotations: int | None = None
 ) -> np.ndarray:
-    """Turn a radar image into a fake lidar image.
-
-    The same network gives the same image whether it is in training or evaluation mode: batch norm takes the
-    statistics of this one image, there is no dropout, and nothing in the network changes.
+    """Generate a lidar image from a radar image.
 
     Parameters
     ----------
-    generator : ResnetGenerator or UnetGenerator
-        The trained network.
+    generator : Generator
+        The trained network. The paper's gives the same image in training and in evaluation mode.
     radar_image : array, shape (h, w), uint8
         Power image of one scan; h and w multiples of 4, and those the network was trained on.
     bf16 : bool
-        Multiply in bfloat16: quicker where `has_bf16`.
-    headings : int, optional
-        Quarter turns of the image, 1 to 4, that are translated and averaged before the tanh: what a network draws
-        in one heading only is doubtful. Costs as many times; the paper takes one. Not given: the network's own number.
+        Compute in bfloat16: quicker where `has_bf16`.
+    tta_rotations : int, optional
+        Quarter turns of the image, 1 to 4, whose logits are averaged; the network's own number if not given.
 
     Returns
     -------
-    fake_image : array, shape (h, w), uint8
+    generated : array, shape (h, w), uint8
         0 empty to 255 occupied.
 
     Raises
     ------
     Pix2PixError
-        If the image has another type, shape or size, or the number of headings is none of these.
+        If the image has another type, shape or size, or `tta_rotations` is none of these.
 
     Notes
     -----
@@ -542,23 +499,21 @@ def generate(
     if radar_image.dtype != np.uint8 or radar_image.ndim != 2:
         raise Pix2PixError(f"radar image: expected uint8 (h, w), got {radar_image.dtype} {radar_image.shape}")
     check_size(radar_image.shape, generator.image_size, "radar image", generator.size_step)
-    headings = generator.headings if headings is None else headings
-    if headings not in (1, 2, 3, 4):
-        raise Pix2PixError(f"headings: expected 1 to 4, got {headings}")
-    device = next(generator.parameters()).device
-    autocast = torch.autocast(device.type, torch.bfloat16) if bf16 else nullcontext()
-    radar = to_tensor(radar_image).to(device)
-    with torch.inference_mode(), autocast:
+    n_turns = generator.tta_rotations if tta_rotations is None else tta_rotations
+    if n_turns not in (1, 2, 3, 4):
+        raise Pix2PixError(f"tta_rotations: expected 1 to 4, got {n_turns}")
+    radar = to_tensor(radar_image).to(next(generator.parameters()).device)
+    with torch.inference_mode(), torch.autocast(radar.device.type, torch.bfloat16, enabled=bf16):
         logits = sum(
             torch.rot90(generator.logits(torch.rot90(radar, turn, (2, 3))), -turn, (2, 3))
-            for turn in range(headings)
+            for turn in range(n_turns)
         )
-        fake = torch.tanh(logits / headings)[0, 0]  # (h, w)
-    return torch.round((fake.float() + 1.0) * 127.5).to(torch.uint8).cpu().numpy()
+        generated = torch.tanh(logits / n_turns)[0, 0]  # (h, w)
+    return torch.round((generated.float() + 1.0) * 127.5).to(torch.uint8).cpu().numpy()
 
 
 def check_size(size: tuple[int, ...], expected: tuple[int, int] | None, name: str, step: int = 4) -> None:
-    """Refuse image sizes the network cannot give back, or was not trained on."""
+    """Refuse image sizes that the network cannot process, or was not trained on."""
     if any(n % step or n < max(step, 16) for n in size):
         raise Pix2PixError(
             f"{name}: height and width must be multiples of {step} from {max(step, 16)} on, got {tuple(size)}"
@@ -568,11 +523,7 @@ def check_size(size: tuple[int, ...], expected: tuple[int, int] | None, name: st
 
 
 def save_weights(
-    path: str | Path,
-    generator: ResnetGenerator | UnetGenerator,
-    metadata: dict[str, Any] | None = None,
-    *,
-    half: bool = False,
+    path: str | Path, generator: Generator, metadata: dict[str, Any] | None = None, *, half: bool = False
 ) -> None:
     """Write a generator with what is needed to build it again, atomically.
 
@@ -580,57 +531,118 @@ def save_weights(
     ----------
     path : path
         File to write, ``*.safetensors``.
-    generator : ResnetGenerator or UnetGenerator
+    generator : Generator
         The network.
     metadata : dict, optional
         More to put into the header, JSON values only (seed, settings, session ...).
     half : bool
-        Write float16, half the size; `load_weights` gives float32 again.
+        Write float16, half the size; `load_weights` returns float32.
     """
     about = {
-        "architecture": ARCHITECTURES["resnet" if isinstance(generator, ResnetGenerator) else "unet"],
-        "filters": generator.filters,
-        "blocks": generator.blocks,
+        "architecture": generator.description,
+        "filters": generator.ngf,
+        "blocks": generator.n_blocks,
         "image_size": generator.image_size,
-        "headings": generator.headings,
+        "headings": generator.tta_rotations,
         "torch": str(torch.__version__),
     }
     tensors = {name: value.half() if half else value for name, value in generator.state_dict().items()}
     save_tensors(Path(path), tensors, {**(metadata or {}), **about})
 
 
-def load_weights(
-    path: str | Path, *, filters: int | None = None, blocks: int | None = None
-) -> ResnetGenerator | UnetGenerator:
+def load_weights(path: str | Path) -> Generator:
     """Build a generator from a file of `save_weights`.
 
     Parameters
     ----------
     path : path
         The file.
-    filters, blocks : int, optional
-        Refuse a network of another width or depth; not given: take what the file holds.
 
     Returns
     -------
-    generator : ResnetGenerator or UnetGenerator
-        The network with its weights, on the CPU, for use and not for training: norms with running statistics
-        are multiplied into the convolutions before them.
+    generator : Generator
+        The network with its weights, on the CPU, for inference: norms with running statistics are merged into
+        the convolutions before them.
 
     Raises
     ------
     Pix2PixError
-        If the file is missing, truncated, of another architecture, width, depth, does not hold the weights that
-        its header promises, or holds a value that is not finite; the message names the file.
+        If the file is missing, truncated, of an architecture that is not registered, does not hold the weights
+        of its header's network, or holds a value that is not finite; the message names the file.
+    """
+    return load_network(path).generator
+
+
+@dataclass(frozen=True)
+class TrainedNetwork:
+    """A generator with what is needed to turn a scan into points.
+
+    Attributes
+    ----------
+    generator : Generator
+        The network.
+    points : dict
+        How the generated image becomes points: ``threshold`` and ``thin`` of `rol.bev.image_to_points`.
+    settings : dict
+        How the radar images were made that it was trained on.
+    about : dict
+        Header of its file.
+    """
+
+    generator: Generator
+    points: dict[str, Any]
+    settings: dict[str, Any]
+    about: dict[str, Any]
+
+
+def load_network(path: str | Path) -> TrainedNetwork:
+    """Read a generator with its threshold and the settings of its radar images.
+
+    Parameters
+    ----------
+    path : path
+        File of `save_weights`; its header may hold ``points`` (threshold 128, no thinning otherwise) and
+        ``pairs_settings`` (the defaults of pairs otherwise).
+
+    Returns
+    -------
+    network : TrainedNetwork
+        Ready for `generate`.
+
+    Raises
+    ------
+    Pix2PixError
+        As `load_weights`, or if ``points`` or ``pairs_settings`` of the header hold anything else.
     """
     tensors, about = load_tensors(Path(path))
+    points, settings = _read_points(path, about), dict(about.get("pairs_settings", {}))
+    return TrainedNetwork(_restore_generator(path, tensors, about), points, settings, about)
+
+
+def _read_points(path: str | Path, about: dict[str, Any]) -> dict[str, Any]:
+    """Read how points are made from the header; refuse other types than those of the defaults."""
+    defaults = {"threshold": 128, "thin": False}
+    for name in ("points", "pairs_settings"):
+        if not isinstance(about.get(name, {}), dict):
+            raise Pix2PixError(f"{path}: header: {name} is {about[name]!r:.60}, not a JSON object")
+    points = {**defaults, **about.get("points", {})}
+    for name, value in points.items():
+        if type(value) is not type(defaults.get(name)):
+            raise Pix2PixError(f"{path}: header: points: {name} is {value!r:.60}, known are {defaults}")
+    return points
+
+
+def _restore_generator(path: str | Path, tensors: dict[str, Tensor], about: dict[str, Any]) -> Generator:
+    """Build the generator that the header describes and give it its weights."""
+    try:
+        network = _find_architecture(about.get("architecture"))
+    except Pix2PixError as error:
+        raise Pix2PixError(f"{path}: {error}") from error
     _check_header(path, about)
-    network = next(name for name, words in ARCHITECTURES.items() if words == about["architecture"])
-    for name, wanted in (("filters", filters), ("blocks", blocks)):
-        if wanted is not None and about[name] != wanted:
-            raise Pix2PixError(f"{path}: generator with {about[name]} {name}, expected {wanted}")
     try:  # also raised when the width or depth needs more memory than there is
-        generator = build_generator(about["filters"], about["blocks"], network, rng=torch.Generator())
+        generator = build_generator(
+            about["filters"], about["blocks"], network.architecture, rng=torch.Generator()
+        )
         generator.load_state_dict(tensors)
     except RuntimeError as error:
         raise Pix2PixError(f"{path}: tensors do not fit the header's architecture ({error})") from error
@@ -638,12 +650,9 @@ def load_weights(
         if value.is_floating_point() and not tensors[name].is_floating_point():
             raise Pix2PixError(f"{path}: tensor {name!r} is of {tensors[name].dtype}, expected {value.dtype}")
     generator.image_size = tuple(about["image_size"]) if about.get("image_size") else None
-    generator.headings = int(about.get("headings", 1))
-    if network == "unet":
-        from .unet import fuse
-
-        fuse(generator)
-    return generator.eval()
+    generator.tta_rotations = int(about.get("headings", 1))
+    generator.eval().fuse()
+    return generator
 
 
 def load_metadata(path: str | Path) -> dict[str, Any]:
@@ -657,7 +666,7 @@ def load_metadata(path: str | Path) -> dict[str, Any]:
     Returns
     -------
     metadata : dict
-        What the header holds.
+        Contents of the header.
     """
     return load_tensors(Path(path))[1]
 
@@ -701,7 +710,9 @@ def load_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
     except (SafetensorError, OSError) as error:
         raise Pix2PixError(f"{path}: not a whole safetensors file ({error})") from error
     if about is None:
-        raise Pix2PixError(f"{path}: header says nothing of the network, so not written by rol.pix2pix")
+        raise Pix2PixError(
+            f"{path}: header does not describe a network; the file was not written by rol.pix2pix"
+        )
     try:
         header = json.loads(about)
     except ValueError as error:
@@ -722,10 +733,7 @@ def _check_finite(path: Path, tensors: dict[str, Tensor]) -> None:
 
 
 def _check_header(path: str | Path, about: dict[str, Any]) -> None:
-    """Refuse a header without a known architecture or with sizes of another type."""
-    if about.get("architecture") not in ARCHITECTURES.values():
-        known = list(ARCHITECTURES.values())
-        raise Pix2PixError(f"{path}: architecture {about.get('architecture')!r}, known are {known}")
+    """Refuse a header with sizes of another type or out of range."""
     size = about.get("image_size")
     if size is not None and not (isinstance(size, list) and len(size) == 2):
         raise Pix2PixError(f"{path}: header: image_size is {size!r}, expected two numbers or null")

@@ -1,68 +1,95 @@
-"""The radar room: polar scan to Cartesian image, peaks to points, motion and Doppler correction.
+"""Convert polar radar scans: to a Cartesian image, to peaks and points, with motion compensation.
 
-A scan is an array of half-dB power codes, one row per azimuth, one column per range bin. Azimuths are in our
-convention, counter-clockwise positive; the radar turns clockwise, so they decrease from row to row. Bin ``b``
-lies at the range ``(b + 0.5) * range_resolution + range_offset``. In an image row 0 is farthest forward (x)
-and column 0 farthest left (y); coordinates are those of pixel centres: ``x = ((width - 1) / 2 - row) *
-pixel_size`` and y alike with the column.
+A scan is an array of power in steps of half a decibel, one row per azimuth, one column per range bin. Azimuths are
+counter-clockwise positive; the radar turns clockwise, so they decrease from row to row. In an image row 0 is farthest
+forward (x) and column 0 farthest left (y); coordinates are those of pixel centres: ``x = ((width - 1) / 2 - row) *
+pixel_size``, and y alike with the column.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import cv2
 import numpy as np
 
-# The data set's own kit: 0.0432 m per bin. Three independent measurements on real scans agree on the second
-# pair.
-KIT_RANGE_RESOLUTION, KIT_RANGE_OFFSET = 0.0432, 0.0
-MEASURED_RANGE_RESOLUTION, MEASURED_RANGE_OFFSET = 0.0438, -0.31
+try:
+    from .geometry import exp
+except ImportError:  # this file was copied on its own
+    from geometry import exp
+
 DOPPLER_SECONDS = 0.049  # a target ahead reads nearer by this time multiplied by the closing speed
 SCAN_SECONDS = 0.25  # one turn
-MAX_GAP = 2.5  # rows farther apart than this many mean steps: nothing was measured between them
+MAX_GAP = 2.5  # in wider gaps between rows, in mean row spacings, nothing was measured
 TABLE_STEPS = 64  # entries per row of the table for unevenly spaced azimuths
-_CODE_POWER = 10.0 ** (np.arange(256) / 20.0)  # a code is half a decibel
+
+
+@dataclass(frozen=True)
+class RangeCalibration:
+    """Range of the bins of a scan: ``(bin + 0.5) * resolution_m + offset_m``.
+
+    Attributes
+    ----------
+    resolution_m, offset_m : float
+        Length of a bin, and offset of all ranges [m].
+    """
+
+    resolution_m: float
+    offset_m: float = 0.0
+
+
+SDK = RangeCalibration(0.0432)  # of the data set's SDK
+MEASURED = RangeCalibration(0.0438, -0.31)  # of three independent measurements on real scans
+
+
+@dataclass(frozen=True, eq=False)
+class ScanMotion:
+    """Motion of the radar during a scan.
+
+    Attributes
+    ----------
+    twist : array-like, shape (3,)
+        Constant body velocity (vx, vy, yaw rate) [m/s, m/s, rad/s].
+    scan_seconds : float
+        Time of one turn, spread evenly over the rows [s].
+    doppler_seconds : float
+        Ranges read nearer by this time multiplied by the closing speed [s].
+    """
+
+    twist: np.ndarray | tuple[float, float, float]
+    scan_seconds: float = SCAN_SECONDS
+    doppler_seconds: float = DOPPLER_SECONDS
 
 
 def polar_to_cartesian(
-    codes: np.ndarray,
+    power: np.ndarray,
     azimuths: np.ndarray,
     *,
-    range_resolution: float = KIT_RANGE_RESOLUTION,
-    range_offset: float = KIT_RANGE_OFFSET,
+    calibration: RangeCalibration = SDK,
     pixel_size: float = 0.25,
     width: int = 512,
-    interpolate_crossover: bool = True,
-    twist: np.ndarray | tuple[float, float, float] | None = None,
-    scan_seconds: float = SCAN_SECONDS,
-    doppler_seconds: float = 0.0,
+    motion: ScanMotion | None = None,
 ) -> np.ndarray:
     """Resample a polar scan into a Cartesian image around the radar.
 
-    Without a twist this is the convention of the data set's own kit, bilinear in range and azimuth. With a
-    twist every pixel is taken from where the turning beam saw that place, so the image shows the world in the
-    radar frame at mid-scan.
+    Without motion this is the convention of the data set's SDK, bilinear in range and azimuth. With motion every pixel
+    is taken from where the turning beam saw that place, so the image shows the world in the radar frame at mid-scan.
 
     Parameters
     ----------
-    codes : array, shape (a, b)
-        Power codes 0..255, one row per azimuth.
+    power : array, shape (a, b), uint8
+        Power in half-dB steps, one row per azimuth.
     azimuths : array, shape (a,)
         Counter-clockwise bearings of the rows, decreasing, not wrapped [rad]. A pixel is interpolated between
         the two rows next to its bearing; in gaps wider than ``MAX_GAP`` mean steps the image is 0.
-    range_resolution, range_offset : float
-        Length of a bin and shift of all ranges [m].
+    calibration : RangeCalibration
+        Range of the bins.
     pixel_size : float
         Edge of a pixel [m].
     width : int
         Number of rows and of columns of the image.
-    interpolate_crossover : bool
-        Wrap one row at each end, so that the seam between last and first row is interpolated as well.
-    twist : array-like, shape (3,), optional
-        Constant body velocity (vx, vy, yaw rate) [m/s, m/s, rad/s]; None for no correction.
-    scan_seconds : float
-        Time of one turn, spread evenly over the rows [s]; used with a twist.
-    doppler_seconds : float
-        Ranges read nearer by this time multiplied by the closing speed [s]; used with a twist.
+    motion : ScanMotion, optional
+        Motion to compensate; None for none.
 
     Returns
     -------
@@ -72,13 +99,13 @@ def polar_to_cartesian(
     Raises
     ------
     ValueError
-        If shapes disagree, the codes are no power codes, or the azimuths do not decrease within one turn.
+        If shapes disagree, the power is not uint8, or the azimuths do not decrease within one turn.
 
     Notes
     -----
     Input of the generator in Yin et al. 2020, Sec. III-A; 512 pixels of 0.25 m: Sec. IV-A.
     """
-    codes, azimuths = check_scan(codes, azimuths)
+    power, azimuths = check_scan(power, azimuths)
     half = (width - 1) / 2.0 * pixel_size
     axis = np.linspace(half, -half, width, dtype=np.float32)
     x, y = np.repeat(axis[:, None], width, axis=1), np.repeat(axis[None, :], width, axis=0)
@@ -88,48 +115,23 @@ def polar_to_cartesian(
     np.add(clockwise, np.float32(2.0 * np.pi), out=clockwise, where=clockwise < 0.0)
     rows = (clockwise - np.float32(first)) / np.float32(step)
     np.add(rows, np.float32(n_turn), out=rows, where=rows < -1.0)  # scans that do not begin ahead
-    if twist is None:
+    if motion is None:
         ranges = np.sqrt(x * x + y * y)
     else:
-        ranges, rows = _beam_at_places(x, y, rows, len(codes), step, twist, scan_seconds, doppler_seconds)
+        ranges, rows = _beam_at_places(x, y, rows, len(power), step, motion)
     table = _row_table(azimuths, step)
     if table is not None:
         rows = table.take(((rows + np.float32(1.0)) * np.float32(TABLE_STEPS)).astype(np.intp), mode="clip")
-    bins = np.maximum((ranges - range_offset - range_resolution / 2.0) / range_resolution, 0.0).astype(
-        np.float32
-    )
-    used = codes[:, : int(bins.max()) + 2].astype(np.float32) * np.float32(1.0 / 255.0)
-    if interpolate_crossover:
-        used = np.concatenate([used[-1:], used, used[:1]])
-        rows = rows + np.float32(1.0)
+    near, length = calibration.offset_m, calibration.resolution_m
+    bins = np.maximum((ranges - near - length / 2.0) / length, 0.0).astype(np.float32)
+    used = power[:, : int(bins.max()) + 2].astype(np.float32) * np.float32(1.0 / 255.0)
+    # One row more at each end, so that the seam between last and first row is interpolated as well.
+    used, rows = np.concatenate([used[-1:], used, used[:1]]), rows + np.float32(1.0)
     return cv2.remap(used, bins, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=0.0)
 
 
-def twist_to_pose(twist: np.ndarray | tuple[float, float, float], seconds: np.ndarray | float) -> np.ndarray:
-    """Give the pose reached after some time at constant body velocity.
-
-    Parameters
-    ----------
-    twist : array-like, shape (3,)
-        Body velocity (vx, vy, yaw rate) [m/s, m/s, rad/s].
-    seconds : array or float, shape (...)
-        Times since the pose was zero; may be negative [s].
-
-    Returns
-    -------
-    poses : array, shape (..., 3)
-        Pose at these times seen from time zero (x, y, yaw) [m, m, rad].
-    """
-    vx, vy, yaw_rate = (float(v) for v in twist)
-    seconds = np.asarray(seconds, dtype=np.float64)
-    yaw = yaw_rate * seconds
-    along = seconds * np.sinc(yaw / np.pi)  # sin(yaw) / yaw_rate, also where the yaw rate is zero
-    aside = seconds * np.sin(yaw / 2.0) * np.sinc(yaw / (2.0 * np.pi))  # (1 - cos(yaw)) / yaw_rate
-    return np.stack([vx * along - vy * aside, vx * aside + vy * along, yaw], axis=-1)
-
-
-def undistort_points(
-    points: np.ndarray, stamps_s: np.ndarray, twist: np.ndarray | tuple[float, float, float]
+def deskew_points(
+    points: np.ndarray, seconds: np.ndarray, twist: np.ndarray | tuple[float, float, float]
 ) -> np.ndarray:
     """Move points seen at different times into the sensor frame at the reference time.
 
@@ -137,7 +139,7 @@ def undistort_points(
     ----------
     points : array, shape (n, 2) or (n, 3)
         Each point in the frame at its own time [m]; z stays as it is.
-    stamps_s : array, shape (n,)
+    seconds : array, shape (n,)
         Times relative to the reference time [s].
     twist : array-like, shape (3,)
         Constant body velocity (vx, vy, yaw rate) [m/s, m/s, rad/s].
@@ -148,7 +150,7 @@ def undistort_points(
         The points in the frame at the reference time [m].
     """
     points = np.asarray(points, dtype=np.float64)
-    poses = twist_to_pose(twist, stamps_s)
+    poses = exp(twist, seconds)
     c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
     moved = points.copy()
     moved[:, 0] = c * points[:, 0] - s * points[:, 1] + poses[:, 0]
@@ -159,29 +161,29 @@ def undistort_points(
 def doppler_shift(
     azimuths: np.ndarray, velocity: np.ndarray | tuple[float, ...], doppler_seconds: float = DOPPLER_SECONDS
 ) -> np.ndarray:
-    """Give by how much a resting target reads too far because the radar moves.
+    """Compute the range error of a stationary target due to the radar's velocity.
 
     Parameters
     ----------
     azimuths : array, shape (n,)
         Counter-clockwise bearings of the targets [rad].
     velocity : array-like, shape (2,) or more
-        Velocity of the radar (vx, vy, ...), a twist will do [m/s].
+        Velocity of the radar (vx, vy, ...), such as a twist [m/s].
     doppler_seconds : float
         Range error per closing speed [s].
 
     Returns
     -------
     shift : array, shape (n,)
-        Range read minus true range; negative ahead of a radar that drives forward [m].
+        Range read minus true range; negative ahead of a radar that moves forward [m].
     """
     return -doppler_seconds * (velocity[0] * np.cos(azimuths) + velocity[1] * np.sin(azimuths))
 
 
-def row_seconds(n_rows: int, scan_seconds: float = SCAN_SECONDS) -> np.ndarray:
-    """Give the time of every row relative to mid-scan.
+def azimuth_times(n_rows: int, scan_seconds: float = SCAN_SECONDS) -> np.ndarray:
+    """Compute the time of every row relative to mid-scan.
 
-    The stamps inside a file come in bursts of 16, so evenly spread times are the better guess.
+    The stamps inside a file come in bursts of 16, so evenly spread times are more accurate.
 
     Parameters
     ----------
@@ -198,23 +200,15 @@ def row_seconds(n_rows: int, scan_seconds: float = SCAN_SECONDS) -> np.ndarray:
     return (np.arange(n_rows) / n_rows - 0.5) * scan_seconds
 
 
-def compensate_points(
-    points: np.ndarray,
-    twist: np.ndarray | tuple[float, float, float],
-    *,
-    scan_seconds: float = SCAN_SECONDS,
-    doppler_seconds: float = DOPPLER_SECONDS,
-) -> np.ndarray:
-    """Move points found in a scan as recorded to where they are at mid-scan.
+def compensate_points(points: np.ndarray, motion: ScanMotion) -> np.ndarray:
+    """Compensate the motion of points found in a scan as recorded.
 
     Parameters
     ----------
     points : array, shape (n, 2)
         Points in the radar frame, each as it was seen when the beam passed it [m].
-    twist : array-like, shape (3,)
-        Constant body velocity (vx, vy, yaw rate) [m/s, m/s, rad/s].
-    scan_seconds, doppler_seconds : float
-        As in `polar_to_cartesian` [s].
+    motion : ScanMotion
+        Motion to compensate.
 
     Returns
     -------
@@ -227,108 +221,48 @@ def compensate_points(
     """
     points = np.asarray(points, dtype=np.float64)
     bearings, ranges = np.arctan2(points[:, 1], points[:, 0]), np.hypot(points[:, 0], points[:, 1])
-    ranges = ranges - doppler_shift(bearings, twist, doppler_seconds)
-    seconds = (np.mod(-bearings, 2.0 * np.pi) / (2.0 * np.pi) - 0.5) * scan_seconds
+    ranges = ranges - doppler_shift(bearings, motion.twist, motion.doppler_seconds)
+    seconds = (np.mod(-bearings, 2.0 * np.pi) / (2.0 * np.pi) - 0.5) * motion.scan_seconds
     seen = np.stack([ranges * np.cos(bearings), ranges * np.sin(bearings)], axis=1)
-    return undistort_points(seen, seconds, twist)
+    return deskew_points(seen, seconds, motion.twist)
 
 
 def find_peaks(
-    codes: np.ndarray, k: int = 12, min_code: int = 60, min_bin: int = 0
+    power: np.ndarray, k: int = 12, min_power: int = 60, min_bin: int = 0
 ) -> tuple[np.ndarray, np.ndarray]:
     """Find the k strongest local maxima along range in every row.
 
     Parameters
     ----------
-    codes : array, shape (a, b)
-        Power codes.
+    power : array, shape (a, b), uint8
+        Power in half-dB steps.
     k : int
-        Peaks kept per row at most.
-    min_code : int
-        Weakest code kept.
+        Largest number of peaks per row.
+    min_power : int
+        Lowest power of a peak (60 is 30 dB).
     min_bin : int
         Nearest bin kept.
 
     Returns
     -------
     rows, bins : array, shape (n,)
-        Indices of the peaks, by row, the strongest of a row first; equal codes nearest first.
+        Indices of the peaks, by row, the strongest of a row first; equal ones nearest first.
 
     Raises
     ------
     ValueError
-        If the codes are not uint8.
+        If the power is not uint8.
     """
-    codes = _check_codes(codes)
-    is_peak = codes >= max(min_code, 1)
-    is_peak[:, 1:] &= codes[:, 1:] > codes[:, :-1]  # of a plateau the first bin counts
-    is_peak[:, :-1] &= codes[:, :-1] >= codes[:, 1:]
+    power = check_power(power)
+    is_peak = power >= max(min_power, 1)
+    is_peak[:, 1:] &= power[:, 1:] > power[:, :-1]  # of a plateau the first bin counts
+    is_peak[:, :-1] &= power[:, :-1] >= power[:, 1:]
     is_peak[:, :min_bin] = False
     rows, bins = np.nonzero(is_peak)
-    order = np.lexsort((bins, -codes[rows, bins].astype(np.int64), rows))
+    order = np.lexsort((bins, -power[rows, bins].astype(np.int64), rows))
     rows, bins = rows[order], bins[order]
     rank = np.arange(len(rows)) - np.searchsorted(rows, rows)
     return rows[rank < k], bins[rank < k]
-
-
-def cfar_peaks(
-    codes: np.ndarray,
-    *,
-    guard_bins: int = 12,
-    train_bins: int = 40,
-    threshold_db: float = 12.0,
-    min_bin: int = 0,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Find local maxima along range that stand out from what surrounds them (cell-averaging CFAR).
-
-    Parameters
-    ----------
-    codes : array, shape (a, b)
-        Power codes in half decibels.
-    guard_bins, train_bins : int
-        Bins left out next to the cell on either side, and bins beyond them whose mean power is the floor.
-    threshold_db : float
-        How far above the floor a cell must be [dB].
-    min_bin : int
-        Nearest bin kept.
-
-    Returns
-    -------
-    rows, bins : array, shape (n,)
-        Indices of the detections, by row, near ones first.
-
-    Raises
-    ------
-    ValueError
-        If the codes are not uint8, a width is not positive or a row is too short for the window.
-
-    Notes
-    -----
-    Cells at the ends of a row take the floor from the side they have. The floor is a mean of powers, not of
-    decibels, as in the classical detector.
-    """
-    codes, reach = _check_codes(codes), guard_bins + train_bins
-    if guard_bins < 0 or train_bins < 1 or codes.shape[1] <= 2 * reach:
-        raise ValueError(
-            f"CFAR: guard {guard_bins} and train {train_bins} bins do not fit codes {codes.shape}"
-        )
-    sums = np.cumsum(_CODE_POWER[codes], axis=1, dtype=np.float64)
-    sums = np.concatenate([np.zeros((len(codes), 1)), sums], axis=1)
-    edges = np.clip(
-        np.arange(codes.shape[1])[:, None] + (-reach, -guard_bins, guard_bins + 1, reach + 1),
-        0,
-        codes.shape[1],
-    )
-    n_cells = (edges[:, 1] - edges[:, 0]) + (edges[:, 3] - edges[:, 2])
-    floor = (
-        sums[:, edges[:, 1]] - sums[:, edges[:, 0]] + sums[:, edges[:, 3]] - sums[:, edges[:, 2]]
-    ) / n_cells
-    found = _CODE_POWER[codes] > floor * 10.0 ** (threshold_db / 10.0)
-    found[:, 1:] &= codes[:, 1:] > codes[:, :-1]  # of a plateau the first bin counts
-    found[:, :-1] &= codes[:, :-1] >= codes[:, 1:]
-    found[:, :min_bin] = False
-    rows, bins = np.nonzero(found)
-    return rows, bins
 
 
 def peaks_to_points(
@@ -337,13 +271,10 @@ def peaks_to_points(
     azimuths: np.ndarray,
     *,
     max_range_m: float = np.inf,
-    range_resolution: float = KIT_RANGE_RESOLUTION,
-    range_offset: float = KIT_RANGE_OFFSET,
-    twist: np.ndarray | tuple[float, float, float] | None = None,
-    scan_seconds: float = SCAN_SECONDS,
-    doppler_seconds: float = 0.0,
+    calibration: RangeCalibration = SDK,
+    motion: ScanMotion | None = None,
 ) -> np.ndarray:
-    """Turn peaks of a polar scan into points.
+    """Convert peaks of a polar scan into points.
 
     Parameters
     ----------
@@ -353,17 +284,15 @@ def peaks_to_points(
         Counter-clockwise bearings of all rows [rad].
     max_range_m : float
         Points farther away are dropped [m].
-    range_resolution, range_offset : float
-        Length of a bin and shift of all ranges [m].
-    twist : array-like, shape (3,), optional
-        Body velocity; with it the points are moved to mid-scan [m/s, m/s, rad/s].
-    scan_seconds, doppler_seconds : float
-        As in `polar_to_cartesian`; used with a twist [s].
+    calibration : RangeCalibration
+        Range of the bins.
+    motion : ScanMotion, optional
+        Motion to compensate; None for none.
 
     Returns
     -------
     points : array, shape (n, 2)
-        Points in the radar frame [m].
+        Points in the radar frame [m], at mid-scan if motion is compensated.
 
     Raises
     ------
@@ -371,111 +300,102 @@ def peaks_to_points(
         If the azimuths do not decrease within one turn.
     """
     azimuths = _check_azimuths(azimuths)
-    ranges, bearings = (bins + 0.5) * range_resolution + range_offset, azimuths[rows]
-    if twist is not None:
-        ranges = ranges - doppler_shift(bearings, twist, doppler_seconds)
-    points = np.stack([ranges * np.cos(bearings), ranges * np.sin(bearings)], axis=1)[ranges <= max_range_m]
-    if twist is None:
+    ranges, bearings = (bins + 0.5) * calibration.resolution_m + calibration.offset_m, azimuths[rows]
+    if motion is not None:
+        ranges = ranges - doppler_shift(bearings, motion.twist, motion.doppler_seconds)
+    is_near = ranges <= max_range_m
+    points = np.stack([ranges * np.cos(bearings), ranges * np.sin(bearings)], axis=1)[is_near]
+    if motion is None:
         return points
-    return undistort_points(
-        points, row_seconds(len(azimuths), scan_seconds)[rows[ranges <= max_range_m]], twist
+    return deskew_points(
+        points, azimuth_times(len(azimuths), motion.scan_seconds)[rows[is_near]], motion.twist
     )
 
 
 def k_strongest_peaks(
-    codes: np.ndarray,
+    power: np.ndarray,
     azimuths: np.ndarray,
     k: int = 12,
-    min_code: int = 60,
-    min_range_m: float = 2.5,
+    min_power: int = 60,
     *,
-    max_range_m: float = np.inf,
-    range_resolution: float = KIT_RANGE_RESOLUTION,
-    range_offset: float = KIT_RANGE_OFFSET,
-    twist: np.ndarray | tuple[float, float, float] | None = None,
-    scan_seconds: float = SCAN_SECONDS,
-    doppler_seconds: float = 0.0,
+    range_limits_m: tuple[float, float] = (2.5, np.inf),
+    calibration: RangeCalibration = SDK,
+    motion: ScanMotion | None = None,
 ) -> np.ndarray:
-    """Turn a scan into points without a network: the k strongest peaks of every azimuth.
+    """Convert a scan into points without a network: the k strongest peaks of every azimuth.
 
     Parameters
     ----------
-    codes : array, shape (a, b)
-        Power codes.
+    power : array, shape (a, b), uint8
+        Power in half-dB steps.
     azimuths : array, shape (a,)
         Counter-clockwise bearings of the rows [rad].
-    k, min_code : int
-        Peaks per row at most, and the weakest code kept (60 is 30 dB).
-    min_range_m, max_range_m : float
-        Points nearer or farther are dropped; the leakage ends about 2.5 m [m].
-    range_resolution, range_offset : float
-        Length of a bin and shift of all ranges [m].
-    twist : array-like, shape (3,), optional
-        Body velocity; with it the points are moved to mid-scan [m/s, m/s, rad/s].
-    scan_seconds, doppler_seconds : float
-        As in `polar_to_cartesian`; used with a twist [s].
+    k, min_power : int
+        As in `find_peaks`.
+    range_limits_m : tuple of float
+        Points nearer or farther are dropped; the leakage ends at about 2.5 m [m].
+    calibration : RangeCalibration
+        Range of the bins.
+    motion : ScanMotion, optional
+        Motion to compensate; None for none.
 
     Returns
     -------
     points : array, shape (n, 2)
-        Points in the radar frame [m].
+        Points in the radar frame [m], at mid-scan if motion is compensated.
 
     Raises
     ------
     ValueError
         If `check_scan` refuses the scan.
     """
-    codes, azimuths = check_scan(codes, azimuths)
-    min_bin = int(np.ceil((min_range_m - range_offset) / range_resolution - 0.5))
-    rows, bins = find_peaks(codes, k, min_code, max(min_bin, 0))
-    return peaks_to_points(
-        rows, bins, azimuths, max_range_m=max_range_m, range_resolution=range_resolution, range_offset=range_offset,
-        twist=twist, scan_seconds=scan_seconds, doppler_seconds=doppler_seconds,
-    )  # fmt: skip
+    power, azimuths = check_scan(power, azimuths)
+    nearest, farthest = range_limits_m
+    min_bin = int(np.ceil((nearest - calibration.offset_m) / calibration.resolution_m - 0.5))
+    rows, bins = find_peaks(power, k, min_power, max(min_bin, 0))
+    return peaks_to_points(rows, bins, azimuths, max_range_m=farthest, calibration=calibration, motion=motion)
 
 
-def check_scan(codes: np.ndarray, azimuths: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Refuse a scan that is transposed, turns the wrong way round, or does not hold power codes.
+def check_scan(power: np.ndarray, azimuths: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Check a scan: not transposed, turning the right way round, and holding power as uint8.
 
     Parameters
     ----------
-    codes : array, shape (a, b), uint8
-        Power codes, one row per azimuth.
+    power : array, shape (a, b), uint8
+        Power in half-dB steps, one row per azimuth.
     azimuths : array, shape (a,)
         Counter-clockwise bearings of the rows, decreasing by less than one turn in all [rad].
 
     Returns
     -------
-    codes, azimuths : array
+    power, azimuths : array
         The same as arrays, azimuths as float64.
 
     Raises
     ------
     ValueError
-        If shapes disagree, the codes are not uint8, or the azimuths do not decrease within one turn.
+        If shapes disagree, the power is not uint8, or the azimuths do not decrease within one turn.
     """
-    codes, azimuths = np.asarray(codes), np.asarray(azimuths, dtype=np.float64)
-    if codes.ndim != 2 or azimuths.shape != codes.shape[:1] or len(codes) < 2:
-        is_turned = codes.ndim == 2 and azimuths.shape == codes.shape[1:]
-        hint = "; the codes are transposed" if is_turned else ""
-        raise ValueError(
-            f"scan: expected codes (a, b) and azimuths (a,), got {codes.shape} and {azimuths.shape}{hint}"
-        )
-    return _check_codes(codes), _check_azimuths(azimuths)
+    power, azimuths = np.asarray(power), np.asarray(azimuths, dtype=np.float64)
+    if power.ndim != 2 or azimuths.shape != power.shape[:1] or len(power) < 2:
+        is_turned = power.ndim == 2 and azimuths.shape == power.shape[1:]
+        hint = "; the power is transposed" if is_turned else ""
+        shapes = f"{power.shape} and {azimuths.shape}"
+        raise ValueError(f"scan: expected power (a, b) and azimuths (a,), got {shapes}{hint}")
+    return check_power(power), _check_azimuths(azimuths)
 
 
-def _check_codes(codes: np.ndarray) -> np.ndarray:
-    """Refuse arrays that hold no power codes, such as power in 0..1."""
-    codes = np.asarray(codes)
-    if codes.ndim != 2 or codes.dtype != np.uint8:
-        raise ValueError(
-            f"scan: expected power codes 0..255 of shape (a, b) as uint8, got {codes.dtype} {codes.shape}"
-        )
-    return codes
+def check_power(power: np.ndarray) -> np.ndarray:
+    """Check that an array holds power in half-dB steps as uint8, shape (a, b); a ValueError if not."""
+    power = np.asarray(power)
+    if power.ndim != 2 or power.dtype != np.uint8:
+        found = f"{power.dtype} {power.shape}"
+        raise ValueError(f"scan: expected power 0..255 of shape (a, b) as uint8, got {found}")
+    return power
 
 
 def _check_azimuths(azimuths: np.ndarray) -> np.ndarray:
-    """Refuse azimuths that rise, such as clockwise ones, or go on beyond one turn."""
+    """Check that azimuths decrease (clockwise ones rise) and stay within one turn."""
     azimuths = np.asarray(azimuths, dtype=np.float64)
     steps = np.diff(azimuths)
     if not (steps < 0.0).all():
@@ -512,22 +432,20 @@ def _beam_at_places(
     rows: np.ndarray,
     n_rows: int,
     step: float,
-    twist: np.ndarray | tuple[float, float, float],
-    scan_seconds: float,
-    doppler_seconds: float,
+    motion: ScanMotion,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Find range and row at which the moving radar saw places given in the frame at mid-scan.
+    """Compute range and row at which the moving radar saw places given in the frame at mid-scan.
 
-    The row tells the time, the time the pose, the pose the row: three rounds of this settle, since the beam
-    turns much faster than places move across it.
+    The row gives the time, the time the pose, and the pose the row. Three iterations converge, since the beam turns
+    much faster than places move across it.
     """
-    vx, vy, yaw_rate = (np.float32(v) for v in twist)
+    vx, vy, yaw_rate = (np.float32(v) for v in motion.twist)
     first_rows = rows
     for _ in range(3):
-        t = (rows / np.float32(n_rows) - np.float32(0.5)) * np.float32(scan_seconds)
+        t = (rows / np.float32(n_rows) - np.float32(0.5)) * np.float32(motion.scan_seconds)
         yaw = yaw_rate * t
         c, s, half = np.cos(yaw), np.sin(yaw), np.float32(0.5) * yaw
-        # Within one turn yaw stays small, so the chord stands for the arc (below 1 mm for a car).
+        # Within one turn yaw is small, so the chord approximates the arc (error below 1 mm for a car).
         dx, dy = x - t * (vx - vy * half), y - t * (vx * half + vy)
         seen_x, seen_y = c * dx + s * dy, c * dy - s * dx
         # The bearing's change is small except next to the radar, so no wrap can make the row jump.
@@ -536,4 +454,4 @@ def _beam_at_places(
         rows = first_rows - turned / np.float32(step)
     ranges = np.sqrt(seen_x * seen_x + seen_y * seen_y)
     closing = (vx * seen_x + vy * seen_y) / np.maximum(ranges, np.float32(1e-6))
-    return ranges - np.float32(doppler_seconds) * closing, np.mod(rows, np.float32(2.0 * np.pi / step))
+    return ranges - np.float32(motion.doppler_seconds) * closing, np.mod(rows, np.float32(2.0 * np.pi / step))

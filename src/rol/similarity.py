@@ -1,8 +1,7 @@
-"""The similarity room: how near are fake points to real ones, and real ones to fake ones.
+"""Nearest-neighbour distances between generated points and lidar points, in the plane [m] (Sec. IV-B).
 
-Everything is measured in metres between nearest neighbours in the plane. Rules for empty clouds: a cloud
-without points has no distances (n = 0) and its shares are nan, so that it is left out of means; against an
-empty reference every distance is infinite, so that the shares are 0.
+Rules for empty clouds: a cloud without points has no distances (n = 0) and its fractions are nan, so that it is left
+out of means; against an empty reference every distance is infinite, so that the fractions are 0.
 """
 
 from __future__ import annotations
@@ -10,14 +9,19 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial import cKDTree
 
+try:
+    from .geometry import check_points
+except ImportError:  # this file was copied on its own
+    from geometry import check_points
+
 
 def nn_distances(points: np.ndarray, reference: np.ndarray) -> np.ndarray:
-    """Give each point's distance to the nearest reference point.
+    """Compute the distance of each point to the nearest reference point.
 
     Parameters
     ----------
     points : array, shape (n, 2)
-        Points asked about [m].
+        Query points [m].
     reference : array, shape (m, 2)
         Points of the k-d tree [m].
 
@@ -33,28 +37,28 @@ def nn_distances(points: np.ndarray, reference: np.ndarray) -> np.ndarray:
 
     Notes
     -----
-    Yin et al. 2020, Sec. IV-B, with the fake points against the tree of the real ones.
+    Yin et al. 2020, Sec. IV-B: generated points against the k-d tree of the lidar points.
     """
-    points, reference = _check_cloud(points, "points"), _check_cloud(reference, "reference")
+    points, reference = check_points(points), check_points(reference, "reference")
     if len(reference) == 0 or len(points) == 0:
         return np.full(len(points), np.inf)
     return cKDTree(reference).query(points)[0]
 
 
-def share_within(distances: np.ndarray, radius: float) -> float:
-    """Give the share of distances below a radius.
+def fraction_within(distances: np.ndarray, radius: float) -> float:
+    """Compute the fraction of distances below a radius.
 
     Parameters
     ----------
     distances : array, shape (n,)
         Distances, infinite allowed [m].
     radius : float
-        Distances below it count [m].
+        Upper limit of the distances that count [m].
 
     Returns
     -------
-    share : float
-        Share in 0..1; nan if there is no distance.
+    fraction : float
+        In 0..1; nan without distances.
 
     Raises
     ------
@@ -68,19 +72,19 @@ def share_within(distances: np.ndarray, radius: float) -> float:
 
 
 def distance_histogram(distances: np.ndarray, edges: np.ndarray) -> np.ndarray:
-    """Count distances in bins; the last bin also takes everything beyond.
+    """Count distances in bins; the last bin includes everything beyond its edge.
 
     Parameters
     ----------
     distances : array, shape (n,)
         Distances, infinite allowed [m].
     edges : array, shape (k + 1,)
-        Edges of the bins, from 0 on [m].
+        Edges of the bins, starting at 0 [m].
 
     Returns
     -------
     counts : array, shape (k,), int64
-        Distances per bin; they add up to n.
+        Distances per bin; their sum is n.
     """
     edges = np.asarray(edges, dtype=np.float64)
     clipped = np.clip(np.asarray(distances, dtype=np.float64), edges[0], edges[-1])
@@ -89,25 +93,26 @@ def distance_histogram(distances: np.ndarray, edges: np.ndarray) -> np.ndarray:
     return np.histogram(clipped, edges)[0]
 
 
-def similarity_summary(fake: np.ndarray, real: np.ndarray) -> dict[str, float | int]:
-    """Compare a fake with a real cloud in both directions.
+def similarity_summary(generated: np.ndarray, lidar: np.ndarray) -> dict[str, float | int]:
+    """Compare generated points with lidar points in both directions.
 
     Parameters
     ----------
-    fake, real : array, shape (n, 2), (m, 2)
-        Clouds in one frame [m].
+    generated, lidar : array, shape (n, 2), (m, 2)
+        Points in one frame [m].
 
     Returns
     -------
     summary : dict
-        ``n_fake``, ``n_real``; for ``fake_to_real`` and ``real_to_fake`` the shares ``_within_1m`` and
-        ``_within_2m`` (0..1) and ``_median_m``; nan where the asking cloud is empty.
+        ``n_fake``, ``n_real``; for ``fake_to_real`` (precision) and ``real_to_fake`` (recall) the fractions
+        ``_within_1m`` and ``_within_2m`` (0..1) and ``_median_m``; nan where the first cloud is empty. "fake" are
+        the generated points, "real" the lidar points.
 
     Notes
     -----
-    Yin et al. 2020, Sec. IV-B report fake to real; the other direction shows what the fake cloud misses.
+    Yin et al. 2020, Sec. IV-B report the precision; the recall shows what the generated points miss.
     """
-    return summarize_distances(nn_distances(fake, real), nn_distances(real, fake))
+    return summarize_distances(nn_distances(generated, lidar), nn_distances(lidar, generated))
 
 
 def summarize_distances(fake_to_real: np.ndarray, real_to_fake: np.ndarray) -> dict[str, float | int]:
@@ -125,19 +130,7 @@ def summarize_distances(fake_to_real: np.ndarray, real_to_fake: np.ndarray) -> d
     """
     summary: dict[str, float | int] = {"n_fake": len(fake_to_real), "n_real": len(real_to_fake)}
     for name, distances in (("fake_to_real", fake_to_real), ("real_to_fake", real_to_fake)):
-        summary[f"{name}_within_1m"] = share_within(distances, 1.0)
-        summary[f"{name}_within_2m"] = share_within(distances, 2.0)
+        summary[f"{name}_within_1m"] = fraction_within(distances, 1.0)
+        summary[f"{name}_within_2m"] = fraction_within(distances, 2.0)
         summary[f"{name}_median_m"] = float(np.median(distances)) if len(distances) else float("nan")
     return summary
-
-
-def _check_cloud(points: np.ndarray, name: str) -> np.ndarray:
-    """Refuse clouds of another shape or with values that are not finite."""
-    points = np.asarray(points, dtype=np.float64)
-    if points.size == 0:
-        return points.reshape(0, 2)
-    if points.ndim != 2 or points.shape[1] != 2:
-        raise ValueError(f"{name}: expected shape (n, 2), got {points.shape}")
-    if not np.isfinite(points).all():
-        raise ValueError(f"{name}: point {int(np.argmin(np.isfinite(points).all(axis=1)))} is not finite")
-    return points

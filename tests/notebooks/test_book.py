@@ -1,5 +1,6 @@
 """The built book as a reader gets it: pages, links, pictures, numbers; and nothing that needs a network."""
 
+import ast
 import re
 from functools import cache
 from pathlib import Path
@@ -8,8 +9,9 @@ from urllib.parse import unquote, urlsplit
 import pytest
 from bs4 import BeautifulSoup
 
-from chapters import book_pages
+from chapters import SOURCE, book_pages
 
+MODULES = [file for file in sorted(SOURCE.rglob("[!.]*.py")) if not file.name.startswith("__")]
 OF_THE_BUILDER = {"genindex.html", "search.html"}
 
 
@@ -41,10 +43,11 @@ def test_every_page_can_be_reached_from_the_first(html: Path) -> None:
     listed = {
         (html / link["href"]).resolve() for link in side.find_all("a", href=True) if link["href"] != "#"
     }
+    code = {page for page in pages_of(html) if "_modules" in page.relative_to(html).parts}
     missing = {
         page for page in pages_of(html) if page.name not in OF_THE_BUILDER | {"index.html", "intro.html"}
     } - listed
-    assert not missing
+    assert not missing - code
 
 
 def test_every_internal_link_and_anchor_resolves(html: Path) -> None:
@@ -63,6 +66,24 @@ def test_every_internal_link_and_anchor_resolves(html: Path) -> None:
             ):
                 broken.append((page.name, link["href"]))
     assert not broken
+
+
+@pytest.mark.parametrize("file", MODULES, ids=lambda file: file.relative_to(SOURCE).as_posix())
+def test_every_public_name_has_signature_docstring_and_code(html: Path, file: Path) -> None:
+    parts = file.relative_to(SOURCE).with_suffix("").parts
+    page, module = html.joinpath("toolbox", *parts).with_suffix(".html"), ".".join(parts)
+    kinds = ast.FunctionDef | ast.ClassDef
+    for member in ast.parse(file.read_text(encoding="utf-8")).body:
+        if isinstance(member, kinds) and not member.name.startswith("_"):
+            head = read_page(page).find("dt", id=f"{module}.{member.name}")
+            assert head is not None, f"{page.name}: {member.name} is missing"
+            assert (
+                f"_modules/{'/'.join(parts)}.html#{member.name}"
+                in head.select_one("a:has(.viewcode-link)")["href"]
+            )
+    for entry in read_page(page).select("dl.py"):
+        assert entry.dd.get_text(strip=True), f"{page.name}: {entry.dt['id']} has no docstring"
+    assert "np.float64(" not in read_page(page).article.get_text()
 
 
 def has_anchor(page: Path, name: str) -> bool:
@@ -84,10 +105,10 @@ def test_every_image_exists_and_has_alt_text(html: Path) -> None:
     assert not faults
 
 
-def test_every_caption_says_virtual_or_real(profile: dict, html: Path) -> None:
+def test_every_caption_says_simulated_or_real(profile: dict, html: Path) -> None:
     for page in book_pages(profile):
         for caption in read_page(html / "notebooks" / f"{page}.html").select("figcaption .caption-text"):
-            assert re.search("virtual|real", caption.get_text(), re.IGNORECASE), (
+            assert re.search("simulated|real", caption.get_text(), re.IGNORECASE), (
                 f"{page}: {caption.get_text()}"
             )
 

@@ -1,23 +1,32 @@
-"""Every page of the built book in a real browser, opened from disk: wide and light, narrow and dark, without a network.
+"""Check every page of the built book in Chromium: wide and light, narrow and dark, from disk, without a network.
 
-The rules are checked by `page.js` in the page and by `browser.py` from what the browser reports. That each of them can
-fail is seen on small pages with one fault each.
+Playwright drives the browser, axe checks contrast, names and headings, `page.js` checks the rest. Small pages with one
+fault each show that every rule can fail.
 """
 
 from __future__ import annotations
 
 import base64
-from collections.abc import Iterator
+import os
+import shutil
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from urllib.parse import unquote, urlsplit
 
 import pytest
-from browser import Browser, BrowserError, View, Visit, find_chromium
+from axe_playwright_python.sync_playwright import Axe
+from playwright.sync_api import Browser, ConsoleMessage, Error, Request, sync_playwright
 
 from chapters import CHAPTERS
 
-WIDE, NARROW = View(1280), View(400, dark=True)
+NAMES = ("chromium", "chromium-browser", "google-chrome")
+OFFLINE = "--host-resolver-rules=MAP * ~NOTFOUND"  # no name is resolved, so nothing leaves the machine
+LOCAL = ("file:", "data:", "blob:", "about:")
+CHECKS = Path(__file__).with_name("page.js").read_text(encoding="utf-8")
+AXE = Axe().axe_script
 RULES = {
     "console": "no error and no warning",
     "request": "every file is there, and nothing is asked of a network",
@@ -33,20 +42,120 @@ RULES = {
     "width": "nothing is wider than the window",
     "contrast": "text stands out from its ground, 4.5 to 1, large text 3 to 1",
 }
-TABS = 2
+BROWSERS = 2  # for the pages of a book, each in its own thread
 FIRST_SCREEN_PX = 800  # height of the window of a small laptop
 NEED_REAL_DATA = ("09_oxford_route", "10_real_radar")  # without it they have no picture
 
 
+@dataclass(frozen=True)
+class View:
+    """How a page is viewed: the width of the window [CSS pixels], the colour scheme, the medium."""
+
+    width: int
+    dark: bool = False
+    medium: str = "screen"
+
+
+WIDE, NARROW = View(1280), View(400, dark=True)
+
+
+@dataclass(frozen=True)
+class Visit:
+    """A page in one view: its address, the view, faults as (rule, what), and what the page holds.
+
+    ``links`` are pairs of the whole address and the attribute, ``anchors`` the names that can be linked to, ``counts``
+    the numbers of equations, images and canvases; ``theme`` is "light" or "dark"; ``picture`` is the lower edge of the
+    first picture [px].
+    """
+
+    address: str
+    view: View
+    faults: list[tuple[str, str]]
+    links: list[tuple[str, str]]
+    anchors: list[str]
+    theme: str
+    counts: dict[str, int]
+    picture: int | None
+
+
+class Tab:
+    """A tab that opens one page after the other and records what a page reports."""
+
+    def __init__(self, browser: Browser) -> None:
+        self.page = browser.new_page()
+        self.page.add_init_script(AXE)
+        self._faults: list[tuple[str, str]] = []
+        self.page.on("console", self._on_console)
+        self.page.on("pageerror", lambda error: self._faults.append(("console", str(error))))
+        self.page.on("request", self._on_request)
+        self.page.on("requestfailed", lambda it: self._faults.append(("request", f"{it.failure}: {it.url}")))
+
+    def _on_console(self, message: ConsoleMessage) -> None:
+        if message.type in ("error", "warning", "assert"):
+            self._faults.append(("console", f"{message.type}: {message.text} {message.location['url']}"))
+
+    def _on_request(self, request: Request) -> None:
+        if not request.url.startswith(LOCAL):
+            self._faults.append(("request", f"asks the network: {request.url}"))
+
+    def look(self, view: View) -> None:
+        """Set the size of the window, the preferred colour scheme, and the medium."""
+        self.page.set_viewport_size({"width": view.width, "height": 900})
+        self.page.emulate_media(color_scheme="dark" if view.dark else "light", media=view.medium)
+
+    def open(self, address: str, view: View) -> None:
+        """Load a page until its load event."""
+        self._faults.clear()
+        self.look(view)
+        self.page.goto(address)
+
+    def visit(self, address: str, views: Sequence[View], known: set[str] | None = None) -> list[Visit]:
+        """Open a page in the first view, switch to the others without loading it again, and check it in each.
+
+        ``known`` are combinations of colours and size whose contrast has been checked; those of this page are added.
+        """
+        self.open(address, views[0])
+        visits, known = [], set() if known is None else known
+        for view in views:
+            self.look(view)
+            seen = self.page.evaluate(CHECKS, list(known))
+            known.update(seen.pop("kinds"))
+            faults = [*self._faults, *((rule, what) for rule, what in seen.pop("faults"))]
+            self._faults.clear()
+            visits.append(Visit(address, view, faults, **seen))
+        return visits
+
+
+def find_chromium() -> str | None:
+    """Return the path of the browser: the environment's ``ROL_CHROMIUM``, else the first of the usual names."""
+    named = os.environ.get("ROL_CHROMIUM")
+    return next(filter(None, map(shutil.which, [named] if named else NAMES)), None)
+
+
+@contextmanager
+def launch(executable: str) -> Iterator[Tab]:
+    """Start a browser that resolves no name, with one tab."""
+    with sync_playwright() as playwright:
+        yield Tab(playwright.chromium.launch(executable_path=executable, args=[OFFLINE]))
+
+
 @pytest.fixture(scope="module")
-def chromium(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
-    """A browser for all tests of this file; without one they skip."""
-    executable = find_chromium()
-    if executable is None:
+def executable() -> str:
+    """The browser; without one the tests skip."""
+    found = find_chromium()
+    if found is None:
         pytest.skip("no Chromium: install `chromium`, or name one in the environment variable ROL_CHROMIUM")
-    browser = Browser(executable, tmp_path_factory.mktemp("chromium"))
-    yield browser
-    browser.close()
+    return found
+
+
+@pytest.fixture(scope="module")
+def tab(executable: str) -> Iterator[Tab]:
+    """One browser for the tests of this file.
+
+    It ends with the file: until then this thread has a running event loop, in which other tests cannot start theirs.
+    """
+    with launch(executable) as opened:
+        yield opened
 
 
 @pytest.fixture
@@ -55,9 +164,10 @@ def html(profile: dict) -> Path:
 
 
 def pages_of(html: Path) -> list[Path]:
-    """List the pages, without the first, which only leads on, and without the theme's own files."""
+    """List the pages, without the first, which only leads on, and the theme's files; of the pages of code only one."""
     pages = [page for page in sorted(html.rglob("*.html")) if "_static" not in page.relative_to(html).parts]
-    return [page for page in pages if page != html / "index.html"]
+    code = [page for page in pages if "_modules" in page.relative_to(html).parts]
+    return [page for page in pages if page != html / "index.html" and page not in code[1:]]
 
 
 @pytest.fixture(scope="module")
@@ -66,18 +176,31 @@ def surveys() -> dict[Path, list[Visit]]:
     return {}
 
 
+@pytest.fixture(scope="module")
+def known() -> set[str]:
+    """Combinations of colours and size that a page of any book has had, with its fault if they have one."""
+    return set()
+
+
 @pytest.fixture
-def visits(html: Path, chromium: Browser, surveys: dict[Path, list[Visit]]) -> list[Visit]:
+def visits(html: Path, executable: str, surveys: dict[Path, list[Visit]], known: set[str]) -> list[Visit]:
     if html not in surveys:
-        addresses, tabs = [page.as_uri() for page in pages_of(html)], [chromium.tab() for _ in range(TABS)]
-        with ThreadPoolExecutor(TABS) as pool:
-            shares = pool.map(survey, tabs, [addresses[k::TABS] for k in range(TABS)])
-            surveys[html] = [visit for share in shares for visit in share]
+        addresses = [page.as_uri() for page in pages_of(html)]
+        shares = [addresses[k::BROWSERS] for k in range(BROWSERS)]
+        with ThreadPoolExecutor(BROWSERS) as pool:
+            visits = pool.map(lambda share: survey(executable, share, known), shares)
+            surveys[html] = [visit for share in visits for visit in share]
     return surveys[html]
 
 
-def survey(tab: object, addresses: list[str]) -> list[Visit]:
-    return [tab.visit(address, view) for address in addresses for view in (WIDE, NARROW)]
+def survey(executable: str, addresses: list[str], known: set[str]) -> list[Visit]:
+    """Visit pages in a browser of their own; every second one is loaded narrow and dark, then made wide and light."""
+    with launch(executable) as tab:
+        return [
+            visit
+            for k, address in enumerate(addresses)
+            for visit in tab.visit(address, (WIDE, NARROW)[:: (-1) ** k], known)
+        ]
 
 
 def told(visit: Visit) -> str:
@@ -143,40 +266,28 @@ def test_pages_are_dark_for_whom_prefers_it(visits: list[Visit]) -> None:
     assert all(visit.theme == ("dark" if visit.view.dark else "light") for visit in visits)
 
 
-def test_search_finds_pages_without_a_network(html: Path, chromium: Browser) -> None:
-    tab = chromium.tab()
-    visit = tab.visit((html / "search.html").as_uri() + "?q=particle", WIDE)
-    assert not visit.faults
-    found = tab.run("""new Promise((done) => {
-        const look = (left) => {
-            const names = [...document.querySelectorAll("#search-results li a")].map((link) => link.href);
-            const isListed = names.some((name) => name.includes("07_localization"));
-            if (isListed || !left) done(names); else setTimeout(look, 100, left - 1);
-        };
-        look(100);
-    })""")
-    assert any("07_localization" in address for address in found), found
-    assert not [words for words in tab.visit(found[0], NARROW).faults if words[0] in ("console", "request")]
+def test_search_finds_pages_without_a_network(html: Path, tab: Tab) -> None:
+    [search] = tab.visit((html / "search.html").as_uri() + "?q=particle", [WIDE])
+    assert not search.faults
+    address = tab.page.locator("#search-results a[href*='07_localization']").first.evaluate("(a) => a.href")
+    [found] = tab.visit(address, [NARROW])
+    assert not [what for rule, what in found.faults if rule in ("console", "request")]
 
 
-def test_first_file_leads_to_the_first_page(html: Path, chromium: Browser) -> None:
-    tab = chromium.tab()
+def test_first_file_leads_to_the_first_page(html: Path, tab: Tab) -> None:
     tab.open((html / "index.html").as_uri(), WIDE)
-    tab.wait_for("Page.loadEventFired", times=2)
-    assert tab.run("location.href") == (html / "intro.html").as_uri()
+    tab.page.wait_for_url((html / "intro.html").as_uri())
 
 
-def test_print_is_black_on_white_and_has_no_controls(html: Path, chromium: Browser) -> None:
-    tab = chromium.tab()
-    page = next(page for page in pages_of(html) if "<canvas" in page.read_text(encoding="utf-8"))
-    tab.open(page.as_uri(), View(800, dark=True, medium="print"))
-    assert tab.run("document.documentElement.dataset.theme") == "dark"
-    assert tab.run("getComputedStyle(document.querySelector('article p')).color") == "rgb(0, 0, 0)"
-    assert tab.run("getComputedStyle(document.body).backgroundColor") == "rgb(255, 255, 255)"
-    controls = ".bd-sidebar-primary, .bd-header-article, article button, article input"
-    shown = f"[...document.querySelectorAll('{controls}')].filter((e) => e.checkVisibility()).length"
-    assert tab.run(shown) == 0
-    assert tab.run("document.documentElement.scrollWidth") <= 800
+def test_print_is_black_on_white_and_has_no_controls(html: Path, tab: Tab) -> None:
+    printed = next(page for page in pages_of(html) if "<canvas" in page.read_text(encoding="utf-8"))
+    tab.open(printed.as_uri(), View(800, dark=True, medium="print"))
+    assert tab.page.evaluate("document.documentElement.dataset.theme") == "dark"
+    assert tab.page.evaluate("getComputedStyle(document.querySelector('article p')).color") == "rgb(0, 0, 0)"
+    assert tab.page.evaluate("getComputedStyle(document.body).backgroundColor") == "rgb(255, 255, 255)"
+    controls = tab.page.locator(".bd-sidebar-primary, .bd-header-article, article button, article input")
+    assert controls.count() and not controls.filter(visible=True).count()
+    assert tab.page.evaluate("document.documentElement.scrollWidth") <= 800
 
 
 # ---- the checker ----------------------------------------------------------------------------------------------
@@ -227,10 +338,10 @@ BAD = [
     ("animation", PLAYER.format(""), "does not play"),
     ("animation", PLAYS.replace("<button", "<button tabindex='-1'"), "keyboard"),
     ("animation", PLAYS.replace("</div>", f"<p hidden>{'a ' * 1_500_000}</p></div>"), "bytes"),
-    ("name", "<a href='#place'>here</a>", "says nothing"),
-    ("name", "<button></button>", "no name"),
-    ("name", "<input type='text'>", "no label"),
-    ("heading", "<h3>Too deep</h3>", "h3 after h1"),
+    ("name", "<a href='#place'>here</a>", "vague"),
+    ("name", "<button></button>", "button-name"),
+    ("name", "<input type='text'>", "label"),
+    ("heading", "<h3>Too deep</h3>", "heading-order"),
     ("heading", "<h1>Another</h1>", "2 headings of the first level"),
     ("table", "<table><tr><td>1</td></tr></table>", "no header"),
     ("width", "<div style='width: 1500px'>wide</div>", "reaches to 1508 px"),
@@ -253,37 +364,51 @@ def small_page(folder: Path, article: str = "", page: str = GOOD) -> str:
 @pytest.mark.parametrize(
     "article", ["", PLAYS, "<div style='overflow: auto'><p style='width: 1500px'>wide</p></div>"]
 )
-def test_good_page_has_no_fault(tmp_path: Path, chromium: Browser, article: str) -> None:
-    visit = chromium.shared_tab().visit(small_page(tmp_path, article), NARROW)
+def test_good_page_has_no_fault(tmp_path: Path, tab: Tab, article: str) -> None:
+    [visit] = tab.visit(small_page(tmp_path, article), [NARROW])
     assert not visit.faults and not broken_links([visit])
 
 
 @pytest.mark.parametrize(
     ("rule", "article", "words"), BAD, ids=[f"{k}-{bad[0]}" for k, bad in enumerate(BAD)]
 )
-def test_rule_bites(tmp_path: Path, chromium: Browser, rule: str, article: str, words: str) -> None:
-    faults = chromium.shared_tab().visit(small_page(tmp_path, article), NARROW).faults
+def test_rule_bites(tmp_path: Path, tab: Tab, rule: str, article: str, words: str) -> None:
+    faults = tab.visit(small_page(tmp_path, article), [NARROW])[0].faults
     assert any(name == rule and words in what for name, what in faults), faults
 
 
 @pytest.mark.parametrize(("before", "ends"), [("", 0), ("<div style='height: 2000px'>words</div>", 2000)])
-def test_place_of_the_first_picture_is_told(
-    tmp_path: Path, chromium: Browser, before: str, ends: int
-) -> None:
+def test_place_of_the_first_picture_is_told(tmp_path: Path, tab: Tab, before: str, ends: int) -> None:
     picture = "<img src='dot.png' alt='A dot' style='display: block; height: 300px'>"
-    visit = chromium.shared_tab().visit(small_page(tmp_path, before + picture), WIDE)
+    [visit] = tab.visit(small_page(tmp_path, before + picture), [WIDE])
     assert ends + 300 < visit.picture < ends + 500
-    assert chromium.shared_tab().visit(small_page(tmp_path), WIDE).picture is None  # a dot is no picture
+    assert tab.visit(small_page(tmp_path), [WIDE])[0].picture is None  # a dot is no picture
 
 
 @pytest.mark.parametrize(
     ("gone", "words"),
-    [(' lang="en"', "no language"), ("A page</title>", "no title"), ('rel="icon"', "no icon")],
+    [(' lang="en"', "html-has-lang"), ("A page</title>", "document-title"), ('rel="icon"', "no icon")],
 )
-def test_rule_of_the_page_bites(tmp_path: Path, chromium: Browser, gone: str, words: str) -> None:
+def test_rule_of_the_page_bites(tmp_path: Path, tab: Tab, gone: str, words: str) -> None:
     page = GOOD.replace(gone, "</title>" if "title" in gone else "")
-    visit = chromium.shared_tab().visit(small_page(tmp_path, page=page), NARROW)
-    assert ("page", words) in visit.faults
+    faults = tab.visit(small_page(tmp_path, page=page), [NARROW])[0].faults
+    assert any(rule == "page" and words in what for rule, what in faults), faults
+
+
+@pytest.mark.parametrize("views", [(WIDE, NARROW), (NARROW, WIDE)])
+def test_fault_of_one_view_is_found_there(tmp_path: Path, tab: Tab, views: tuple[View, View]) -> None:
+    article = "<style>@media (prefers-color-scheme: dark) { h1 { color: #ccc } }</style><p style='width: 700px'>wide</p>"
+    visits = tab.visit(small_page(tmp_path, article), views)
+    assert {view: {rule for rule, _ in visit.faults} for view, visit in zip(views, visits, strict=True)} == {
+        WIDE: set(),
+        NARROW: {"contrast", "width"},
+    }
+
+
+def test_colours_that_were_checked_are_not_checked_again(tmp_path: Path, tab: Tab) -> None:
+    known: set[str] = set()
+    page = small_page(tmp_path, "<p style='color: #999'>pale</p>")
+    assert [len(tab.visit(page, [WIDE], known)[0].faults) for _ in range(2)] == [1, 0]
 
 
 def test_every_rule_is_seen_to_bite() -> None:
@@ -291,22 +416,22 @@ def test_every_rule_is_seen_to_bite() -> None:
 
 
 @pytest.mark.parametrize("target", ["nowhere.html", "#nowhere", "page.html#nowhere", "dot.html?q=1"])
-def test_broken_link_is_found(tmp_path: Path, chromium: Browser, target: str) -> None:
-    visit = chromium.shared_tab().visit(small_page(tmp_path, f"<a href='{target}'>There it is</a>"), WIDE)
+def test_broken_link_is_found(tmp_path: Path, tab: Tab, target: str) -> None:
+    [visit] = tab.visit(small_page(tmp_path, f"<a href='{target}'>There it is</a>"), [WIDE])
     assert [line.rpartition(": ")[2] for line in broken_links([visit])] == [target]
 
 
-def test_page_that_is_not_there_is_an_error(tmp_path: Path, chromium: Browser) -> None:
-    with pytest.raises(BrowserError, match="nowhere"):
-        chromium.shared_tab().open((tmp_path / "nowhere.html").as_uri(), WIDE)
+def test_page_that_is_not_there_is_an_error(tmp_path: Path, tab: Tab) -> None:
+    with pytest.raises(Error, match="nowhere"):
+        tab.open((tmp_path / "nowhere.html").as_uri(), WIDE)
 
 
 def test_browser_that_does_not_start_says_so(tmp_path: Path) -> None:
     program = tmp_path / "broken"
     program.write_text("#!/bin/sh\necho no display today\n", encoding="utf-8")
     program.chmod(0o755)
-    with pytest.raises(BrowserError, match="no display today"):
-        Browser(str(program), tmp_path)
+    with ThreadPoolExecutor() as pool, pytest.raises(Error, match="no display today"):
+        pool.submit(survey, str(program), [], set()).result()
 
 
 def test_browser_is_found_by_the_environment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

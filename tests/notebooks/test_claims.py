@@ -22,7 +22,7 @@ COLOURS = {
     "contradicted": "danger",
     "cannot be tested": "info",
 }
-OURS = ("Virtual", "Real route", "Real scans", "Times")  # lines whose numbers were computed
+OURS = ("Simulated", "Real route", "Real scans", "Times")  # lines whose numbers were computed
 MARKS = (*OURS, "The paper itself")
 # What the paper has: sections, and the last of its equations, figures and tables.
 PLACE = re.compile(r"Abstract|Sec\. (I|II|III-[AB]|IV-[ABC]|V)\b|Eq\. [1-9]\b|Fig\. [1-4]\b|Table I{1,3}\b")

@@ -20,7 +20,7 @@ from chapters import (
     read_notebook,
     run_parameters,
 )
-from rol.rall import find_real_root
+from rol_data.rall import find_real_root
 
 METRICS = {
     *("method", "session", "n_scans", "failures", "rmse_m", "rmse_yaw_deg"),
@@ -56,10 +56,10 @@ def check_localization(folder: Path, session: str, method: str) -> dict:
 
 def test_every_route_run_wrote_its_files(profile: dict, real_root: Path) -> None:
     folders = sorted(Path(profile["out_dir"], "oxford_route").glob("*/*/metrics.json"))
-    assert {folder.parent.name for folder in folders} == {"paper", "rol"}
+    assert {folder.parent.name for folder in folders} == {"paper", "robust"}
     for folder in folders:
         metrics = check_localization(folder.parent, folder.parents[1].name, folder.parent.name)
-        if metrics["method"] == "rol":
+        if metrics["method"] == "robust":
             # The ground truth of session 08 stands still or jumps at about 115 scans, by up to 2.4 m.
             limit_m, share = (0.6, 0.97) if metrics["session"] == "08" else (0.3, 0.99)
             assert metrics["failures"] == 0

@@ -29,7 +29,7 @@ def test_outputs_are_of_this_code(path: Path) -> None:
     notebook = read_notebook(path)
     config = load_config(ROOT / "config/demo.yaml")
     assert notebook.metadata.get("rol", {}).get("digest") == stored_digest(notebook, config), (
-        f"{path.name}, src/rol or config/demo.yaml changed since the stored run; renew it with `make notebooks`"
+        f"{path.name}, the code under src, requirements.lock or config/demo.yaml changed since the stored run; renew it with `make notebooks`"
     )
 
 

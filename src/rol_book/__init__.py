@@ -1,0 +1,1 @@
+"""What the notebooks show: figures, animations, progress bars, checks of their parameters."""

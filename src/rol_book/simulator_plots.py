@@ -1,0 +1,167 @@
+"""Figures that compare simulated with real scans. Nothing here computes a result."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import matplotlib.pyplot as plt
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from rol.radar import MEASURED
+
+STYLES = (
+    {"color": "#0072B2", "linestyle": "-"},
+    {"color": "#E69F00", "linestyle": "-"},
+    {"color": "#009E73", "linestyle": "--"},
+)
+GREYS = plt.get_cmap("gray_r", 12)  # few levels: noise in fine ones makes large files and shows no more
+
+
+def draw_statistics(found: Mapping[str, dict]) -> Figure:
+    """Draw the statistics of several sets of scans over each other, one panel for each statistic.
+
+    Parameters
+    ----------
+    found : mapping
+        Name of a set -> its statistics, from `rol_study.radar_statistics.scan_statistics`; three sets at most, drawn in turn.
+
+    Returns
+    -------
+    figure : Figure
+        Six panels.
+    """
+    figure, axes = plt.subplots(2, 3, figsize=(9.6, 6.2), dpi=84)
+    draws = (
+        _draw_histogram,
+        _draw_zeros,
+        _draw_range_correlation,
+        _draw_rings,
+        _draw_azimuth_spread,
+        _draw_range_spread,
+    )
+    for ax, draw in zip(axes.ravel(), draws, strict=True):
+        for (name, statistics), look in zip(found.items(), STYLES, strict=False):
+            draw(ax, statistics, {**look, "label": name})
+    figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside upper left", ncols=3)
+    return figure
+
+
+def draw_doppler(ax: Axes, found: Mapping[str, dict]) -> Axes:
+    """Draw how well scans agree for every Doppler shift tried, a cross where they agree best.
+
+    Parameters
+    ----------
+    ax : Axes
+        Where to draw.
+    found : mapping
+        Name of a set -> its statistics, from `rol_study.radar_statistics.motion_statistics`.
+
+    Returns
+    -------
+    ax : Axes
+        The axes.
+    """
+    for (name, statistics), look in zip(found.items(), STYLES, strict=False):
+        shifts, values = (np.array(part) for part in zip(*statistics["doppler_curve"].items(), strict=True))
+        ax.plot(1000.0 * shifts, values - values.max(), label=name, **look)
+    ax.axvline(0.0, color="#444444", linewidth=0.8)
+    ax.set(xlabel="Doppler range shift per closing speed [ms]", ylabel="correlation, less its best")
+    ax.legend(loc="lower center")
+    return ax
+
+
+def draw_auc_by_group(axes: Sequence[Axes], found: Mapping[str, Mapping[str, float]]) -> Sequence[Axes]:
+    """Draw which patches a classifier separates simulated from real scans.
+
+    Parameters
+    ----------
+    axes : sequence of Axes
+        One for each way to sort the patches.
+    found : mapping
+        From `rol_study.two_sample_classifier.auc_by_group`.
+
+    Returns
+    -------
+    axes : sequence of Axes
+        The axes.
+    """
+    labels = {"range": "range of the patch [m]", "brightest": "brightest code in the patch"}
+    for ax, (name, values) in zip(axes, found.items(), strict=True):
+        ax.bar(
+            list(values), [value - 0.5 for value in values.values()], bottom=0.5, color="#E69F00", width=0.7
+        )
+        ax.axhline(0.5, color="#444444", linewidth=1.0)
+        ax.set(xlabel=labels.get(name, name), ylabel="area under the curve", ylim=(0.3, 1.0))
+        ax.tick_params(axis="x", labelrotation=30)
+    return axes
+
+
+def draw_polar_pair(
+    axes: Sequence[Axes], scans: Mapping[str, np.ndarray], *, max_range: float = 100.0
+) -> None:
+    """Draw scans as they are stored, one above the other: a row per azimuth, range to the right.
+
+    Parameters
+    ----------
+    axes : sequence of Axes
+        One per scan.
+    scans : mapping
+        Title -> codes, shape (400, 3768).
+    max_range : float
+        Where to stop [m].
+    """
+    for ax, (title, codes) in zip(axes, scans.items(), strict=True):
+        ax.imshow(
+            codes,
+            cmap=GREYS,
+            aspect="auto",
+            vmin=0,
+            vmax=96,
+            interpolation="antialiased",
+            extent=(MEASURED.offset_m, MEASURED.offset_m + MEASURED.resolution_m * codes.shape[1], 360, 0),
+        )
+        ax.set(title=title, xlim=(0, max_range), yticks=np.arange(0, 361, 90), ylabel="azimuth [deg]")
+        ax.grid(False)
+    axes[-1].set_xlabel("range [m]")
+
+
+def _draw_histogram(ax: Axes, statistics: dict, look: dict) -> None:
+    fractions = statistics["histogram"]
+    codes = np.flatnonzero(fractions > 0)
+    ax.semilogy(codes, fractions[codes], linewidth=1.2, **look)
+    ax.set(xlabel="code", ylabel="fraction of pixels", title="codes", xlim=(0, 140))
+
+
+def _draw_zeros(ax: Axes, statistics: dict, look: dict) -> None:
+    ranges, fractions = zip(*statistics["zero_fractions"].items(), strict=True)
+    ax.plot(ranges, fractions, marker="o", markersize=3.5, **look)
+    ax.set(xlabel="range [m]", ylabel="fraction of code 0", title="quiet bins", ylim=(0.25, 0.6))
+
+
+def _draw_range_correlation(ax: Axes, statistics: dict, look: dict) -> None:
+    values = statistics["range_correlation"]
+    ax.plot(MEASURED.resolution_m * np.arange(1, len(values) + 1), values, marker="o", markersize=3.5, **look)
+    ax.set(xlabel="distance along range [m]", ylabel="correlation", title="noise along range", ylim=(0, 1))
+
+
+def _draw_rings(ax: Axes, statistics: dict, look: dict) -> None:
+    rings = statistics["fractions_40_by_range"]
+    middles = [np.sqrt(np.prod([float(edge) for edge in ring.split("-")])) for ring in rings]
+    ax.loglog(middles, list(rings.values()), marker="o", markersize=3.5, **look)
+    ax.set(xlabel="range [m]", ylabel="fraction of codes ≥ 40", title="brightness")
+    ax.set_xticks([5, 10, 20, 50, 100], ["5", "10", "20", "50", "100"])
+    ax.minorticks_off()
+
+
+def _draw_azimuth_spread(ax: Axes, statistics: dict, look: dict) -> None:
+    levels = statistics["point_spread"]["azimuth_db"]
+    ax.plot(0.9 * np.arange(len(levels)), levels, marker="o", markersize=3.5, **look)
+    ax.set(xlabel="azimuth off the peak [deg]", ylabel="level [dB]", title="a bright point in azimuth")
+
+
+def _draw_range_spread(ax: Axes, statistics: dict, look: dict) -> None:
+    levels = statistics["point_spread"]["range_db"]
+    ax.plot(MEASURED.resolution_m * np.arange(len(levels)), levels, **look)
+    ax.set(xlabel="range off the peak [m]", ylabel="level [dB]", title="a bright point in range")

@@ -1,0 +1,314 @@
+"""Read the lidar map, ground truth and radar odometry of the paper's sessions, and single scans.
+
+The paper's first author published them with a later work (Yin et al., "RaLL", T-ITS 2021). The files lie in a folder
+that is called `real_root`, in the layout of the public repositories, see `data/README.md`. All poses are (x, y, yaw)
+in the frame of the map [m, m, rad], y left, yaw counter-clockwise.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from rol.files import read_text
+from rol.geometry import log, relative_pose
+from rol.oxford import compose_odometry, load_radar, load_radar_odometry
+from rol.pairs import estimate_twists
+
+MAP_PATH = Path("RaLL/data/maps/RobotCar/png/oxford_laser_map.png")
+POSES_PATH = Path("RaLL/data/gt_poses/RobotCar")
+ODOMETRY_PATH = Path("RaLL/data/odom/RobotCar")
+SCANS_PATH = Path("RadarSLAMPy/data/tiny")
+SCAN_POSES_PATH = Path("oxford_scan_map_poses.csv")  # in no public repository, so it comes with the book
+MAP_CELL = 0.25  # side of a pixel of the map [m]
+# Of the published image; x at the upper edge of the first row, y at the left edge of the first column [m].
+MAP_SHAPE, MAP_CORNER = (8000, 8000), (1500.0, 800.0)
+
+
+class RallError(ValueError):
+    """Raised for a file of the real data that is missing or not what it should be; names file and fault."""
+
+
+@dataclass(frozen=True)
+class RealScan:
+    """A real radar scan whose pose on the real map is known.
+
+    Attributes
+    ----------
+    path : Path
+        The file.
+    stamp_us : int
+        Time of its first row [us].
+    power, azimuths : array, shape (400, b) and (400,)
+        Power power, and counter-clockwise bearings of the rows [rad].
+    pose : array, shape (3,)
+        Pose of the radar at mid-scan in the frame of the map [m, m, rad].
+    twist : tuple of float, or None
+        Body velocity [m/s, m/s, rad/s]; None if unknown.
+    """
+
+    path: Path
+    stamp_us: int
+    power: np.ndarray
+    azimuths: np.ndarray
+    pose: np.ndarray
+    twist: tuple[float, float, float] | None
+
+
+def find_real_root(given: str | Path = "") -> Path | None:
+    """Find the folder of the real data.
+
+    Parameters
+    ----------
+    given : path
+        The folder; if empty, the environment variable ROL_REAL_ROOT, and `data/real` where that is not set.
+
+    Returns
+    -------
+    root : Path or None
+        The folder, or None if it does not hold the lidar map.
+
+    Raises
+    ------
+    RallError
+        If a folder is given and does not exist.
+    """
+    if given and not Path(given).is_dir():
+        raise RallError(f"real_root: there is no folder {given}")
+    root = Path(given or os.environ.get("ROL_REAL_ROOT") or "data/real")
+    return root if (root / MAP_PATH).is_file() else None
+
+
+def find_scan_poses(real_root: Path | str) -> Path:
+    """Find the file with the map poses of single scans: under `real_root`, else the one in `data`."""
+    own = Path(real_root) / SCAN_POSES_PATH
+    return own if own.is_file() else Path("data") / SCAN_POSES_PATH
+
+
+def load_map_points(path: Path | str, shape: tuple[int, int] | None = None) -> np.ndarray:
+    """Read the lidar map, an image of occupied cells.
+
+    Parameters
+    ----------
+    path : path
+        PNG of 0.25 m per pixel, zero for free, 255 for occupied; x points up and y to the left.
+    shape : tuple of int, optional
+        Rows and columns that the image must have, such as ``MAP_SHAPE``; any if not given.
+
+    Returns
+    -------
+    points : array, shape (n, 2)
+        Centres of the occupied cells in the map frame [m].
+
+    Raises
+    ------
+    RallError
+        If the file is missing, no grey image, of another size, with other values, or empty.
+    """
+    path = Path(path)
+    image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED) if path.is_file() else None
+    if image is None:
+        raise RallError(f"{path}: missing or not an image")
+    if image.ndim != 2:
+        raise RallError(f"{path}: expected one grey channel, got shape {image.shape}")
+    if shape is not None and image.shape != shape:
+        raise RallError(f"{path}: {image.shape} pixels instead of {shape}, so their places are not known")
+    is_odd = (image != 0) & (image != 255)
+    if is_odd.any():
+        raise RallError(f"{path}: holds the value {image[is_odd][0]}; 0 is free and 255 occupied")
+    rows, columns = np.nonzero(image)
+    if len(rows) == 0:
+        raise RallError(f"{path}: the map holds no occupied cell")
+    x, y = MAP_CORNER
+    return np.column_stack([x - MAP_CELL * (rows + 0.5), y - MAP_CELL * (columns + 0.5)])
+
+
+def load_poses(path: Path | str) -> np.ndarray:
+    """Read the ground truth of a session in the frame of the map.
+
+    Parameters
+    ----------
+    path : path
+        `pose_xy_NN.txt`: x, y, yaw, one row per radar scan.
+
+    Returns
+    -------
+    poses : array, shape (n, 3)
+        Poses of the radar at mid-scan [m, m, rad].
+
+    Raises
+    ------
+    RallError
+        If the file is missing, or a row does not hold three finite numbers.
+    """
+    return _load_rows(path)
+
+
+def load_odometry(path: Path | str) -> np.ndarray:
+    """Read the authors' radar odometry, ICP between generated clouds.
+
+    Parameters
+    ----------
+    path : path
+        `seqNN_odom.txt`: dx, dy, dyaw in the body frame; row i moves scan i to scan i + 1.
+
+    Returns
+    -------
+    increments : array, shape (n, 3)
+        Odometry increments [m, m, rad]. Files 01 and 02 hold one row too many.
+
+    Raises
+    ------
+    RallError
+        If the file is missing, or a row does not hold three finite numbers.
+    """
+    return _load_rows(path)
+
+
+def load_scan_poses(path: Path | str) -> dict[int, np.ndarray]:
+    """Read the map poses of single radar scans.
+
+    Parameters
+    ----------
+    path : path
+        `oxford_scan_map_poses.csv`: timestamp_us, x_m, y_m, yaw_rad under a line of names.
+
+    Returns
+    -------
+    poses : dict
+        Time of the scan's first row [us] -> pose at mid-scan, shape (3,).
+
+    Raises
+    ------
+    RallError
+        If the file is missing or a row is at fault.
+    """
+    path, poses = Path(path), {}
+    if not path.is_file():
+        raise RallError(f"{path}: missing")
+    lines = read_text(path, RallError).splitlines()
+    if [word.strip() for word in lines[:1]] != ["timestamp_us,x_m,y_m,yaw_rad"]:
+        raise RallError(f"{path}: columns are {','.join(lines[:1])!r}, expected timestamp_us,x_m,y_m,yaw_rad")
+    for number, line in enumerate(lines[1:], start=2):
+        words = line.split(",")
+        try:
+            poses[int(words[0])] = np.array([float(word) for word in words[1:4]])
+        except ValueError as error:
+            raise RallError(f"{path}: line {number}: {error}") from error
+        if len(words) != 4 or not np.isfinite(poses[int(words[0])]).all():
+            raise RallError(f"{path}: line {number}: expected timestamp_us,x_m,y_m,yaw_rad, all finite")
+    return poses
+
+
+def load_scans(real_root: Path | str) -> list[RealScan]:
+    """Read all real radar scans with a known pose on the map.
+
+    Parameters
+    ----------
+    real_root : path
+        Folder of the real data, see `find_real_root`.
+
+    Returns
+    -------
+    scans : list of RealScan
+        In the order of time: every scan under ``RadarSLAMPy/data/tiny/radar`` with a row in
+        ``oxford_scan_map_poses.csv``, see `find_scan_poses`. The velocity is that of the official odometry beside the
+        scans; outside its span, that between the poses of neighbours less than a second away, if there is one.
+
+    Raises
+    ------
+    RallError
+        If the poses are missing or at fault, or none of the scans is there.
+    rol.oxford.OxfordError
+        If a scan or the odometry is at fault.
+    """
+    folder, poses = Path(real_root) / SCANS_PATH / "radar", load_scan_poses(find_scan_poses(real_root))
+    stamps = sorted(stamp for stamp in poses if (folder / f"{stamp}.png").is_file())
+    if not stamps:
+        raise RallError(f"{folder}: holds none of the {len(poses)} scans of {SCAN_POSES_PATH}")
+    twists = {
+        **_twists_between(poses),
+        **_official_twists(folder.parent / "gt" / "radar_odometry.csv", stamps),
+    }
+    scans = []
+    for stamp in stamps:
+        path = folder / f"{stamp}.png"
+        scan = load_radar(path)
+        scans.append(RealScan(path, stamp, scan.power, scan.azimuths, poses[stamp], twists.get(stamp)))
+    return scans
+
+
+def group_scans(stamps_us: Sequence[int], max_gap_s: float = 1.0) -> list[list[int]]:
+    """Divide scans into groups without a long gap in time.
+
+    Parameters
+    ----------
+    stamps_us : sequence of int
+        Times of the scans [us], in order.
+    max_gap_s : float
+        Largest gap between scans of one group [s].
+
+    Returns
+    -------
+    groups : list of list of int
+        Indices of the scans of each group, in the order of time; none is empty.
+
+    Raises
+    ------
+    RallError
+        If the times do not increase.
+    """
+    groups: list[list[int]] = []
+    for i, stamp in enumerate(stamps_us):
+        gap_us = stamp - stamps_us[i - 1] if i else 0
+        if i and gap_us <= 0:
+            raise RallError(f"scan {i}: its time does not come after that of the scan before")
+        if i and gap_us <= max_gap_s * 1e6:
+            groups[-1].append(i)
+        else:
+            groups.append([i])
+    return groups
+
+
+def _official_twists(path: Path, stamps: list[int]) -> dict[int, tuple[float, float, float]]:
+    """Estimate the velocity of the scans that the official odometry covers; none if it has gaps."""
+    if not path.is_file():
+        return {}
+    odometry = load_radar_odometry(path)
+    try:
+        known = dict(zip(compose_odometry(odometry)[0].tolist(), estimate_twists(odometry), strict=True))
+    except ValueError:
+        return {}
+    return {stamp: tuple(float(v) for v in known[stamp]) for stamp in stamps if stamp in known}
+
+
+def _twists_between(poses: dict[int, np.ndarray]) -> dict[int, tuple[float, float, float]]:
+    """Estimate the velocity of scans from the poses of their neighbours less than a second away."""
+    stamps, found = sorted(poses), {}
+    for i, stamp in enumerate(stamps):
+        near = [other for other in stamps[max(i - 1, 0) : i + 2] if abs(other - stamp) < 1_000_000]
+        if len(near) > 1:
+            seconds = (near[-1] - near[0]) * 1e-6
+            twist = log(relative_pose(poses[near[0]], poses[near[-1]])) / seconds
+            found[stamp] = tuple(float(value) for value in twist)
+    return found
+
+
+def _load_rows(path: Path | str) -> np.ndarray:
+    path = Path(path)
+    if not path.is_file():
+        raise RallError(f"{path}: missing")
+    try:
+        rows = np.loadtxt(read_text(path).splitlines(), ndmin=2)
+    except ValueError as error:
+        raise RallError(f"{path}: not a table of numbers: {error}") from error
+    if rows.ndim != 2 or rows.shape[1:] != (3,) or len(rows) == 0:
+        raise RallError(f"{path}: expected rows of three numbers, got shape {rows.shape}")
+    if not np.isfinite(rows).all():
+        raise RallError(f"{path}: row {int(np.argwhere(~np.isfinite(rows))[0, 0]) + 1} is not finite")
+    return rows

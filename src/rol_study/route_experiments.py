@@ -1,0 +1,609 @@
+"""Experiments on the real route with sampled points: runs of the filters, kidnapping, global localization.
+
+Map, ground truth and odometry are the authors' own; the points of each scan are sampled from the map at the true pose
+(`rol_study.sampled_points`). What a filter needs beforehand, the motion model and the reference contrast, is calibrated on
+another session.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from time import perf_counter
+
+import numpy as np
+
+from rol.evaluation import FailureMonitor, FailureRule
+from rol.geometry import compose, relative_pose
+from rol.mcl import MapGrid, MclSettings, ParticleFilter, localize
+from rol_beyond.motion import MotionModel, gate_odometry
+from rol_beyond.recovery import (
+    RecoveringFilter,
+    RecoverySettings,
+    RecoveryUpdate,
+    measure_reference_contrast,
+)
+from rol_beyond.robust import settings_for
+from rol_beyond.scan_matching import ScanToMapSettings, scan_to_map_icp
+from rol_data.rall import MAP_PATH, MAP_SHAPE, load_map_points
+from rol_study.oxford_route import (
+    SCAN_US,
+    RouteSession,
+    calibrate_on_another,
+    load_session,
+    published_reference_contrast,
+)
+from rol_study.sampled_points import (
+    FrontEnd,
+    VisiblePoints,
+    find_visible_points,
+    measure_fractions,
+    sample_points,
+    solve_mixture,
+)
+
+CELL_M = 0.25  # of the filters' grids: the pixel of the real map
+
+
+@dataclass(frozen=True)
+class RouteExperiment:
+    """Everything that a run over one session needs.
+
+    Attributes
+    ----------
+    session : RouteSession
+        The session.
+    map_points : array, shape (m, 2)
+        The real map [m].
+    front_end : FrontEnd
+        Properties of the sampled points.
+    visible : VisiblePoints
+        Points of the map visible from each true pose.
+    parts : array, shape (3,)
+        Parts of near points, points beside and false ones that have the front end's precision over the whole session.
+    motion : MotionModel
+        Calibrated on the session `calibration_session`.
+    calibration_session : str
+        Its number; "" where there is no other session.
+    reference_contrast : float
+        Score contrast of a scan at its correct pose, measured on that session; where there is none,
+        `rol_study.oxford_route.published_reference_contrast`.
+    grid : MapGrid
+        Of the method `robust`.
+    """
+
+    session: RouteSession
+    map_points: np.ndarray
+    front_end: FrontEnd
+    visible: VisiblePoints
+    parts: np.ndarray
+    motion: MotionModel
+    calibration_session: str
+    reference_contrast: float
+    grid: MapGrid
+
+
+def prepare_experiment(
+    real_root: Path | str,
+    number: str,
+    front_end: FrontEnd,
+    *,
+    max_scans: int = 0,
+    n_reference: int = 300,
+    settings: MclSettings | None = None,
+) -> RouteExperiment:
+    """Load a session and the map, find the visible points of all poses, and calibrate on another session.
+
+    Parameters
+    ----------
+    real_root : path
+        Folder of the real data.
+    number : str
+        Session, such as "02".
+    front_end : FrontEnd
+        Properties of the sampled points.
+    max_scans : int
+        Use only the first scans, 0 for all.
+    n_reference : int
+        Scans of the other session on which the reference contrast is measured.
+    settings : MclSettings, optional
+        Of the filter that the reference contrast is for; those of the method `robust` if not given.
+
+    Returns
+    -------
+    experiment : RouteExperiment
+
+    Raises
+    ------
+    rol_data.rall.RallError, rol_study.oxford_route.RouteError
+        If the files are missing or faulty.
+    """
+    map_points = load_map_points(Path(real_root, MAP_PATH), MAP_SHAPE)
+    session = load_session(real_root, number, map_points)
+    sample = session.truth[np.linspace(0, len(session.truth) - 1, 200).astype(int)]
+    parts = _find_parts(map_points, sample, front_end)
+    if max_scans:
+        session = RouteSession(number, session.truth[:max_scans], session.increments[: max_scans - 1])
+    motion, other, poses = calibrate_on_another(real_root, number, map_points)
+    poses = poses[np.linspace(0, len(poses) - 1, min(n_reference, len(poses))).astype(int)]
+    grid = (settings or settings_for("robust")).measurement.build_grid(map_points)
+    reference = _measure_reference(map_points, poses, front_end, grid)
+    visible = find_visible_points(map_points, session.truth)
+    return RouteExperiment(session, map_points, front_end, visible, parts, motion, other, reference, grid)
+
+
+def _measure_reference(
+    map_points: np.ndarray, poses: np.ndarray, front_end: FrontEnd, grid: MapGrid
+) -> float:
+    """Measure the reference contrast at another session's poses; without them give the published one."""
+    if not len(poses):
+        return published_reference_contrast(front_end.fraction_1m)
+    visible, rng = find_visible_points(map_points, poses), np.random.default_rng(0)
+    clouds = sample_points(map_points, poses, visible, front_end, rng)
+    return measure_reference_contrast(clouds, poses, grid)
+
+
+def _find_parts(map_points: np.ndarray, poses: np.ndarray, front_end: FrontEnd) -> np.ndarray:
+    """Find the parts of the kinds of points that have the front end's precision on average over poses."""
+    visible, rng = find_visible_points(map_points, poses), np.random.default_rng(0)
+    kinds = measure_fractions(map_points, poses, visible, front_end, rng)
+    return solve_mixture(kinds, front_end.fraction_1m, front_end.fraction_2m)
+
+
+def sample_session(experiment: RouteExperiment, seed: int) -> list[np.ndarray]:
+    """Sample the points of all scans of a session.
+
+    Parameters
+    ----------
+    experiment : RouteExperiment
+        Session, map and front end.
+    seed : int
+        Of the points.
+
+    Returns
+    -------
+    clouds : list of array, shape (m, 2)
+        One per scan, in the radar frame [m].
+    """
+    rng, e = np.random.default_rng([seed, int(experiment.session.number)]), experiment
+    return list(sample_points(e.map_points, e.session.truth, e.visible, e.front_end, rng, e.parts))
+
+
+@dataclass(frozen=True)
+class FilterRun:
+    """Results of one run over a session, scan by scan.
+
+    Attributes
+    ----------
+    poses : array, shape (n, 3)
+        Estimates T_map_radar [m, m, rad].
+    covariances : array, shape (n, 3, 3)
+        Of the particles [m, m, rad].
+    failures : list of int
+        Scans at which the run failed by the rule of failures.
+    is_lost : array of bool, shape (n,)
+        The filter reported that it was lost; never with the method `paper`.
+    normalized_score : array, shape (n,)
+        See `rol_beyond.recovery.RecoveryUpdate`; NaN for the method `paper`.
+    n_particles : array of int, shape (n,)
+        Particles.
+    update_ms : array, shape (n,)
+        Time of each update [ms].
+    """
+
+    poses: np.ndarray
+    covariances: np.ndarray
+    failures: list[int]
+    is_lost: np.ndarray
+    normalized_score: np.ndarray
+    n_particles: np.ndarray
+    update_ms: np.ndarray
+
+
+def run_paper(
+    session: RouteSession,
+    clouds: Iterable[np.ndarray],
+    particle_filter: ParticleFilter,
+    rule: FailureRule | None = None,
+) -> FilterRun:
+    """Run the paper's filter, with a reset to the ground truth after each failure.
+
+    Parameters
+    ----------
+    session : RouteSession
+        The session.
+    clouds : iterable of array, shape (m, 2)
+        Points of each scan [m].
+    particle_filter : ParticleFilter
+        At the start of the session.
+    rule : FailureRule, optional
+        When a run has failed.
+
+    Returns
+    -------
+    run : FilterRun
+        Yin et al. 2020, Sec. III-B and IV-C.
+    """
+    monitor = FailureMonitor(session.stamps_us, session.truth, rule or FailureRule())
+    updates = localize(particle_filter, session.increments, clouds, monitor)
+    rows, times = _collect(updates, lambda u: (u.pose, u.covariance, False, np.nan, len(u.particles)))
+    return FilterRun(*rows[:2], monitor.failures, *rows[2:], times)
+
+
+def run_robust(
+    session: RouteSession,
+    clouds: Iterable[np.ndarray],
+    robust_filter: RecoveringFilter,
+    rule: FailureRule | None = None,
+) -> FilterRun:
+    """Run the robust filter, without resets.
+
+    Parameters
+    ----------
+    session, clouds, rule
+        As for `run_paper`; a failure that lasts counts again each time that the rule is fulfilled anew.
+    robust_filter : RecoveringFilter
+        At the start of the session.
+
+    Returns
+    -------
+    run : FilterRun
+    """
+    updates = localize(robust_filter, gate_odometry(session.increments), clouds)
+    rows, times = _collect(
+        updates, lambda u: (u.pose, u.covariance, u.is_lost, u.normalized_score, u.n_particles)
+    )
+    monitor = FailureMonitor(session.stamps_us, session.truth, rule or FailureRule())
+    for index, pose in enumerate(rows[0]):
+        monitor(index, pose)
+    return FilterRun(*rows[:2], monitor.failures, *rows[2:], times)
+
+
+def run_scan_to_map(
+    session: RouteSession,
+    clouds: Iterable[np.ndarray],
+    map_points: np.ndarray,
+    rule: FailureRule | None = None,
+    settings: ScanToMapSettings | None = None,
+) -> FilterRun:
+    """Register each scan to the map by ICP, without a filter, with a reset to the ground truth after each failure.
+
+    Parameters
+    ----------
+    session, clouds, rule
+        As for `run_paper`.
+    map_points : array, shape (m, 2)
+        The map [m].
+    settings : ScanToMapSettings, optional
+        Settings of `rol_beyond.scan_matching.scan_to_map_icp`.
+
+    Returns
+    -------
+    run : FilterRun
+        ``is_lost`` marks rejected registrations; there are no covariances, no normalized score and no particles (NaN, NaN
+        and 0). Yin et al. 2020, Sec. III-B.
+    """
+    monitor = FailureMonitor(session.stamps_us, session.truth, rule or FailureRule())
+    settings, start = settings or ScanToMapSettings(), session.truth[0]
+    results = scan_to_map_icp(session.increments, clouds, map_points, start, monitor, settings)
+    nothing = np.full((3, 3), np.nan)
+    rows, times = _collect(results, lambda r: (r.T_target_source, nothing, not r.converged, np.nan, 0))
+    return FilterRun(*rows[:2], monitor.failures, *rows[2:], times)
+
+
+def _collect(updates: Iterable, read: Callable) -> tuple[list[np.ndarray], np.ndarray]:
+    """Run a filter to its end; return the values read from each update as arrays, and its time [ms]."""
+    rows, times, begin = [], [], perf_counter()
+    for update in updates:
+        times.append(1000.0 * (perf_counter() - begin))
+        rows.append(read(update))
+        begin = perf_counter()
+    return [np.array(column) for column in zip(*rows, strict=True)], np.array(times)
+
+
+def run_method(
+    experiment: RouteExperiment,
+    method: str,
+    clouds: Sequence[np.ndarray],
+    seed: int,
+    *,
+    rule: FailureRule | None = None,
+    recovery: RecoverySettings | None = None,
+    **changes: object,
+) -> FilterRun:
+    """Run a method over the session, started at the ground truth.
+
+    Parameters
+    ----------
+    experiment : RouteExperiment
+        Session, map and calibration.
+    method : str
+        "paper", "robust" or "registration", see `run_paper`, `run_robust` and `run_scan_to_map`.
+    clouds : sequence of array, shape (m, 2)
+        Points of each scan [m].
+    seed : int
+        Of the particles.
+    rule : FailureRule, optional
+        When a run has failed.
+    recovery : RecoverySettings, optional
+        Of the method `robust`, if they differ from the defaults.
+    **changes
+        Settings that differ from the method's own, see `rol_beyond.robust.settings_for`.
+
+    Returns
+    -------
+    run : FilterRun
+    """
+    session, map_points = experiment.session, experiment.map_points
+    if method == "registration":
+        return run_scan_to_map(session, clouds, map_points, rule)
+    rng, start = np.random.default_rng([seed, int(session.number), 1]), session.truth[0]
+    settings = settings_for(method, **{"cell_m": CELL_M, **changes})
+    if method == "paper":
+        grid = settings.measurement.build_grid(map_points)
+        return run_paper(session, clouds, ParticleFilter(grid, start, settings, rng), rule)
+    settings = replace(settings, motion=experiment.motion)
+    recovery = recovery or RecoverySettings(experiment.reference_contrast)
+    return run_robust(session, clouds, RecoveringFilter(map_points, start, settings, recovery, rng), rule)
+
+
+def displace(pose: np.ndarray, distance_m: float, turn: float, rng: np.random.Generator) -> np.ndarray:
+    """Displace a pose by a distance in a random direction, and turn it to a random side.
+
+    Parameters
+    ----------
+    pose : array, shape (3,)
+        Pose [m, m, rad].
+    distance_m, turn : float
+        Distance [m] and angle [rad].
+    rng : numpy.random.Generator
+        Random generator.
+
+    Returns
+    -------
+    pose : array, shape (3,)
+    """
+    angle = rng.uniform(-np.pi, np.pi)
+    there = compose(pose, np.array([distance_m * np.cos(angle), distance_m * np.sin(angle), 0.0]))
+    return there + np.array([0.0, 0.0, turn * rng.choice([-1.0, 1.0])])
+
+
+@dataclass(frozen=True)
+class RecoveryTrial:
+    """Result of a run that began at a wrong pose.
+
+    Attributes
+    ----------
+    found_s : float
+        Time after which the estimate was correct, and stayed so for two seconds [s]; infinite if it never was.
+    told_share : float
+        Fraction of the scans with a wrong estimate, after the first two seconds, at which the filter reported that it was
+        lost; NaN if there were none.
+    error_m : float
+        Position error at the end [m].
+    is_lost_at_end : bool
+        The filter reported at the last scan that it was lost.
+    n_particles : int
+        Largest number of particles.
+    seconds : float
+        Wall-clock time [s].
+    """
+
+    found_s: float
+    told_share: float
+    error_m: float
+    is_lost_at_end: bool
+    n_particles: int
+    seconds: float
+
+
+def evaluate_recovery(
+    updates: Sequence[RecoveryUpdate],
+    truth: np.ndarray,
+    seconds: float = 0.0,
+    *,
+    limits: tuple[float, float] = (1.0, np.deg2rad(5.0)),
+    n_stay: int = 8,
+) -> RecoveryTrial:
+    """Evaluate how the pose was found.
+
+    Parameters
+    ----------
+    updates : sequence of RecoveryUpdate
+        From `rol_beyond.recovery.RecoveringFilter`.
+    truth : array, shape (n, 3)
+        Ground-truth poses of the same scans [m, m, rad].
+    seconds : float
+        Wall-clock time, to be recorded [s].
+    limits : tuple of float
+        An estimate is correct within these [m, rad].
+    n_stay : int
+        For this number of scans; two seconds.
+
+    Returns
+    -------
+    trial : RecoveryTrial
+    """
+    poses = np.array([update.pose for update in updates])
+    off = relative_pose(truth[: len(poses)], poses)
+    distance = np.hypot(off[:, 0], off[:, 1])
+    is_right = (distance < limits[0]) & (np.abs(off[:, 2]) < limits[1])
+    is_lost = np.array([update.is_lost for update in updates])
+    is_long = len(poses) >= n_stay
+    stays = np.convolve(is_right, np.ones(n_stay), "valid") > n_stay - 0.5 if is_long else np.zeros(1)
+    wrong = ~is_right[n_stay:]
+    return RecoveryTrial(
+        found_s=float(np.argmax(stays) * SCAN_US * 1e-6) if stays.any() else float("inf"),
+        told_share=float(is_lost[n_stay:][wrong].mean()) if wrong.any() else float("nan"),
+        error_m=float(distance[-1]),
+        is_lost_at_end=bool(is_lost[-1]),
+        n_particles=int(max(update.n_particles for update in updates)),
+        seconds=seconds,
+    )
+
+
+def run_from(
+    experiment: RouteExperiment,
+    first: int,
+    start: np.ndarray,
+    n_scans: int,
+    seed: int,
+    *,
+    is_start_known: bool,
+) -> tuple[list[RecoveryUpdate], list[np.ndarray]]:
+    """Run the method `robust` from a given scan on, starting at a pose that is not the true one.
+
+    Parameters
+    ----------
+    experiment : RouteExperiment
+        Session, map and calibration.
+    first, n_scans : int
+        First scan, and the largest number of scans; a run from an unknown start ends two seconds after the filter has
+        reported that it is not lost.
+    start : array, shape (3,)
+        Start pose given to the filter [m, m, rad].
+    seed : int
+        Of points and particles.
+    is_start_known : bool
+        False: the filter treats the start only as the centre of the search.
+
+    Returns
+    -------
+    updates : list of RecoveryUpdate
+        One per scan.
+    clouds : list of array, shape (m, 2)
+        Their points [m].
+
+    Raises
+    ------
+    ValueError
+        If the session has no such first scan.
+    """
+    _check_first(experiment, first)
+    e, poses = experiment, experiment.session.truth[first : first + n_scans]
+    rng, starts = np.random.default_rng([seed, first]), e.visible.starts[first : first + len(poses) + 1]
+    visible = VisiblePoints(e.visible.points[starts[0] : starts[-1]], starts - starts[0])
+    sampling = sample_points(e.map_points, poses, visible, e.front_end, rng, e.parts)
+    updates, clouds, n_found = [], [], 0
+
+    def keep_clouds() -> Iterator[np.ndarray]:
+        for cloud in sampling:
+            clouds.append(cloud)
+            yield cloud
+
+    settings, recovery = settings_for("robust", motion=e.motion), RecoverySettings(e.reference_contrast)
+    robust_filter = RecoveringFilter(e.map_points, start, settings, recovery, rng, is_start_known, e.grid)
+    increments = gate_odometry(e.session.increments[first:])
+    for update in localize(robust_filter, increments, keep_clouds()):
+        updates.append(update)
+        n_found = 0 if update.is_lost else n_found + 1
+        if not is_start_known and n_found > 8:
+            break
+    return updates, clouds
+
+
+def _check_first(experiment: RouteExperiment, first: int) -> None:
+    """Raise for a first scan that the session does not have; a negative one would count from its end."""
+    number, n_scans = experiment.session.number, len(experiment.session.truth)
+    if not 0 <= first < n_scans:
+        raise ValueError(f"first: {first} is no scan of session {number}, which has {n_scans}")
+
+
+def kidnap(
+    experiment: RouteExperiment, first: int, seed: int, *, n_scans: int = 60
+) -> tuple[RecoveryTrial, list, list]:
+    """Start 20 m and 20 deg off, with a filter that takes the start for known (kidnapped robot).
+
+    Parameters
+    ----------
+    experiment : RouteExperiment
+        Session, map and calibration.
+    first : int
+        First scan.
+    seed : int
+        Of the direction, the points and the particles.
+    n_scans : int
+        Number of scans.
+
+    Returns
+    -------
+    trial : RecoveryTrial
+        Result.
+    updates, clouds : list
+        See `run_from`.
+
+    Raises
+    ------
+    ValueError
+        If the session has no such first scan.
+    """
+    _check_first(experiment, first)
+    truth, rng = experiment.session.truth[first:], np.random.default_rng([seed, first, 2])
+    start, begin = displace(truth[0], 20.0, np.deg2rad(20.0), rng), perf_counter()
+    updates, clouds = run_from(experiment, first, start, n_scans, seed, is_start_known=True)
+    return evaluate_recovery(updates, truth, perf_counter() - begin), updates, clouds
+
+
+def localize_globally(
+    experiment: RouteExperiment, first: int, seed: int, *, within_m: float = 300.0, n_scans: int = 480
+) -> tuple[RecoveryTrial, list, list]:
+    """Start with a circle that contains the position, and an unknown heading (global localization).
+
+    Parameters
+    ----------
+    experiment : RouteExperiment
+        Session, map and calibration.
+    first : int
+        First scan.
+    seed : int
+        Of the circle, the points and the particles.
+    within_m : float
+        Radius of the circle; the position is uniformly distributed in it [m].
+    n_scans : int
+        Largest number of scans; two minutes.
+
+    Returns
+    -------
+    trial : RecoveryTrial
+        Result.
+    updates, clouds : list
+        See `run_from`.
+
+    Raises
+    ------
+    ValueError
+        If the session has no such first scan.
+    """
+    _check_first(experiment, first)
+    truth, rng = experiment.session.truth[first:], np.random.default_rng([seed, first, 3])
+    start = displace(truth[0], within_m * np.sqrt(rng.random()), 0.0, rng)
+    start[2] = rng.uniform(-np.pi, np.pi)
+    begin = perf_counter()
+    updates, clouds = run_from(experiment, first, start, n_scans, seed, is_start_known=False)
+    return evaluate_recovery(updates, truth, perf_counter() - begin), updates, clouds
+
+
+def add_outliers(session: RouteSession, fraction: float, rng: np.random.Generator) -> RouteSession:
+    """Disturb a fraction of the increments by 0.5 m to 2 m in a random direction, and up to 5 deg.
+
+    Parameters
+    ----------
+    session : RouteSession
+        The session.
+    fraction : float
+        Fraction of the increments.
+    rng : numpy.random.Generator
+        Random generator.
+
+    Returns
+    -------
+    session : RouteSession
+        The same with other increments.
+    """
+    increments, chosen = session.increments.copy(), rng.random(len(session.increments)) < fraction
+    n = int(chosen.sum())
+    angles, lengths = rng.uniform(-np.pi, np.pi, n), rng.uniform(0.5, 2.0, n)
+    turns = np.deg2rad(rng.uniform(-5.0, 5.0, n))
+    increments[chosen] += np.column_stack([lengths * np.cos(angles), lengths * np.sin(angles), turns])
+    return replace(session, increments=increments)

@@ -1,0 +1,261 @@
+"""Sessions of the real route: consistency of their parts, evaluation of a recovery, sampled points at real poses."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from rol.evaluation import FailureRule, pose_errors, rmse
+from rol.geometry import compose, transform_points
+from rol_beyond.motion import MotionModel
+from rol_beyond.recovery import DetectionSettings, RecoverySettings
+from rol_beyond.robust import settings_for
+from rol_beyond.scan_matching import ScanToMapSettings
+from rol_data import rall
+from rol_study.oxford_route import (
+    RouteError,
+    RouteSession,
+    calibrate_on_another,
+    list_sessions,
+    load_session,
+    published_motion,
+    published_reference_contrast,
+)
+from rol_study.route_experiments import (
+    RouteExperiment,
+    add_outliers,
+    displace,
+    evaluate_recovery,
+    kidnap,
+    localize_globally,
+    prepare_experiment,
+    run_method,
+    run_scan_to_map,
+    sample_session,
+)
+from rol_study.sampled_points import FrontEnd
+
+MAP = np.array([[0.0, 0.0], [100.0, 100.0]])
+MAP_ALL = np.array([[-2000.0, -2000.0], [2000.0, 2000.0]])  # holds any route
+
+
+def write_route(root: Path, number: str, n: int = 60, n_steps: int | None = None, **places: tuple) -> Path:
+    """Write poses along a line and their steps; `places` moves single poses."""
+    poses = np.column_stack([np.linspace(0.0, 50.0, n), np.full(n, 50.0), np.zeros(n)])
+    for row, place in places.items():
+        poses[int(row[1:]), :2] = place
+    steps = np.tile([50.0 / (n - 1), 0.0, 0.0], ((n - 1) if n_steps is None else n_steps, 1))
+    for path, rows in (
+        (root / rall.POSES_PATH / f"pose_xy_{number}.txt", poses),
+        (root / rall.ODOMETRY_PATH / f"seq{number}_odom.txt", steps),
+    ):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        np.savetxt(path, rows)
+    return root
+
+
+def test_a_session_is_read_with_or_without_its_last_row(tmp_path: Path) -> None:
+    for number, n_steps in (("03", 59), ("04", 60)):
+        route = load_session(write_route(tmp_path, number, n_steps=n_steps), number, MAP)
+        assert route.truth.shape == (60, 3) and route.increments.shape == (59, 3)
+        np.testing.assert_allclose(route.true_increments, route.increments, atol=1e-6)
+        assert np.diff(route.stamps_us).tolist() == [250_000] * 59
+    assert list_sessions(tmp_path) == ["03", "04"]
+
+
+def test_parts_that_do_not_belong_together_are_named(tmp_path: Path) -> None:
+    with pytest.raises(
+        RouteError, match=r"seq03_odom.txt: 57 increments for the 60 poses of pose_xy_03.txt; 59 needed"
+    ):
+        load_session(write_route(tmp_path, "03", n_steps=57), "03", MAP)
+    with pytest.raises(RouteError, match=r"pose_xy_05.txt: pose 8 at \(900.0, 1.0\) m is outside the map"):
+        load_session(write_route(tmp_path, "05", p7=(900.0, 1.0)), "05", MAP)
+    with pytest.raises(rall.RallError, match=r"pose_xy_06.txt: row 3 is not finite"):
+        load_session(write_route(tmp_path, "06", p2=(np.nan, 1.0)), "06", MAP)
+    with pytest.raises(rall.RallError, match=r"pose_xy_99.txt: missing"):
+        load_session(tmp_path, "99", MAP)
+
+
+def test_motion_is_calibrated_on_another_session_if_there_is_one(tmp_path: Path) -> None:
+    root = write_route(tmp_path, "03")
+    model, other, poses = calibrate_on_another(root, "03", MAP)
+    assert model == published_motion() and other == "" and poses.shape == (0, 3)
+    model, other, _ = calibrate_on_another(write_route(root, "01", n=80), "03", MAP)
+    assert other == "01" and model != published_motion()
+
+
+def test_the_published_motion_is_that_of_session_01(real_root: Path) -> None:
+    taught, kept = calibrate_on_another(real_root, "02", MAP_ALL)[0], published_motion()
+    for name in ("sigma_stationary", "sigma_base", "sigma_per_metre"):
+        np.testing.assert_allclose(getattr(kept, name), getattr(taught, name), atol=0.002)
+    for name in ("matrix", "stationary_matrix"):
+        np.testing.assert_allclose(
+            np.diag(getattr(kept, name))[[0, 2]], np.diag(getattr(taught, name))[[0, 2]], atol=0.01
+        )
+    assert kept.matrix[1][2] == pytest.approx(taught.matrix[1][2], abs=0.05)
+
+
+def test_the_published_contrast_is_that_of_session_01(real_root: Path) -> None:
+    for front_end in (FrontEnd(), FrontEnd(0.50, 0.70), FrontEnd(0.65, 0.80), FrontEnd(0.80, 0.90)):
+        taught = prepare_experiment(real_root, "02", front_end, max_scans=3)
+        assert taught.calibration_session == "01"
+        assert published_reference_contrast(front_end.fraction_1m) == pytest.approx(
+            taught.reference_contrast, abs=0.003
+        )
+    assert 0.048 < published_reference_contrast(0.45) < 0.1 and published_reference_contrast(
+        0.3
+    ) == published_reference_contrast(0.4)
+
+
+def test_a_session_alone_is_not_calibrated_on_itself(real_root: Path, tmp_path: Path) -> None:
+    for name in (
+        rall.MAP_PATH,
+        f"{rall.POSES_PATH}/pose_xy_02.txt",
+        f"{rall.ODOMETRY_PATH}/seq02_odom.txt",
+    ):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).symlink_to(real_root / name)
+    experiment = prepare_experiment(tmp_path, "02", FrontEnd(), max_scans=3)
+    assert (experiment.calibration_session, experiment.reference_contrast, experiment.motion) == (
+        "",
+        published_reference_contrast(0.4),
+        published_motion(),
+    )
+
+
+@pytest.fixture(scope="module")
+def street() -> tuple[RouteSession, np.ndarray, list[np.ndarray]]:
+    """A drive of 40 scans between rows of posts, its odometry a little short, and what is near in each scan."""
+    rng = np.random.default_rng(5)
+    posts = rng.uniform((-40.0, -30.0), (80.0, 30.0), (300, 2))
+    truth = np.column_stack([np.arange(40.0), np.zeros(40), 0.01 * np.arange(40.0)])
+    steps = np.tile([0.97, 0.0, 0.012], (39, 1))
+    clouds = [
+        np.column_stack([c * x + s * y, c * y - s * x]) + 0.05 * rng.standard_normal((len(posts), 2))
+        for (px, py, yaw) in truth
+        for c, s in [(np.cos(yaw), np.sin(yaw))]
+        for x, y in [(posts - (px, py)).T]
+    ]
+    return RouteSession("09", truth, steps), posts, clouds
+
+
+def test_registration_alone_follows_good_points(street: tuple) -> None:
+    route, posts, clouds = street
+    run = run_scan_to_map(route, clouds, posts)
+    errors = pose_errors(run.poses, route.truth)
+    assert errors.position_m.max() < 0.05 and np.abs(errors.yaw_rad).max() < 0.002
+    assert not run.is_lost.any() and not run.failures and run.update_ms.shape == (40,)
+    near = [cloud[np.hypot(*cloud.T) < 20.0] for cloud in clouds]
+    seen = run_scan_to_map(route, near, posts, settings=ScanToMapSettings(range_m=25.0))
+    assert pose_errors(seen.poses, route.truth).position_m.max() < 0.2
+
+
+def test_a_rejected_registration_leaves_the_guess(street: tuple) -> None:
+    route, posts, clouds = street
+    empty = [clouds[0], *[np.zeros((0, 2))] * 39]
+    run, guess = run_scan_to_map(route, empty, posts), route.truth[0]
+    assert run.is_lost.tolist() == [False] + [True] * 39
+    start = run.poses[0]
+    for k in range(1, 40):
+        start = compose(start, route.increments[k - 1])
+        np.testing.assert_allclose(run.poses[k], start, atol=1e-9)
+    assert np.hypot(*(run.poses[0] - guess)[:2]) < 0.05
+    asked = run_scan_to_map(
+        route, clouds, posts, settings=ScanToMapSettings(min_inlier_ratio=1.0)
+    )  # the trim leaves 90 %
+    assert asked.is_lost.all()
+
+
+def test_registration_is_reset_to_the_truth_after_a_failure(street: tuple) -> None:
+    route, posts, _ = street
+    rule, empty = FailureRule(max_position_m=3.0, seconds=1.0), [np.zeros((0, 2))] * 40
+    run = run_scan_to_map(RouteSession("09", route.truth, 0.5 * route.increments), empty, posts, rule)
+    assert len(run.failures) >= 2
+    for k in run.failures:
+        if k < 39:
+            off = pose_errors(run.poses[k + 1 : k + 2], route.truth[k + 1 : k + 2]).position_m[0]
+            assert off < 1.0 and pose_errors(run.poses[k : k + 1], route.truth[k : k + 1]).position_m[0] > 3.0
+
+
+@pytest.mark.parametrize("begin", [kidnap, localize_globally])
+@pytest.mark.parametrize("first", [-20, 40])
+def test_a_start_at_no_scan_of_the_session_is_refused(street: tuple, begin: Callable, first: int) -> None:
+    route, posts, _ = street
+    experiment = RouteExperiment(route, posts, FrontEnd(), None, None, MotionModel(), "", 0.2, None)
+    with pytest.raises(ValueError, match=f"first: {first} is no scan of session .*, which has 40"):
+        begin(experiment, first, 1)
+
+
+def test_a_run_takes_the_registration_and_other_recovery_settings(street: tuple) -> None:
+    route, posts, clouds = street
+    experiment = RouteExperiment(
+        route,
+        posts,
+        FrontEnd(),
+        None,
+        None,
+        MotionModel(),
+        "",
+        0.2,
+        settings_for("robust").measurement.build_grid(posts),
+    )
+    alone = run_method(experiment, "registration", clouds, 1)
+    np.testing.assert_array_equal(alone.poses, run_scan_to_map(route, clouds, posts).poses)
+    wrong = [transform_points((9.0, 7.0, 0.3), cloud) for cloud in clouds]
+    told = run_method(experiment, "robust", wrong, 1)
+    blind = RecoverySettings(0.2, detection=DetectionSettings(search_below=-np.inf, lost_below=-np.inf))
+    quiet = run_method(experiment, "robust", wrong, 1, recovery=blind)
+    assert told.is_lost.any() and not quiet.is_lost.any()
+    assert told.n_particles.max() > 1000 >= quiet.n_particles.max()
+
+
+@dataclass
+class Reported:
+    """Fields of an update that are evaluated."""
+
+    pose: np.ndarray
+    is_lost: bool
+    n_particles: int = 7
+
+
+def test_recovery_is_evaluated_by_the_first_estimate_that_stays_right() -> None:
+    truth, wrong, right = np.zeros((40, 3)), np.array([9.0, 0.0, 0.0]), np.array([0.5, 0.0, 0.0])
+    updates = [Reported(right if k in (3, 4) or k >= 20 else wrong, is_lost=k < 14) for k in range(40)]
+    trial = evaluate_recovery(updates, truth)
+    assert trial.found_s == 5.0  # scans 3 and 4 did not last
+    assert trial.told_share == pytest.approx(6 / 12)  # of scans 8 to 19
+    assert trial.error_m == 0.5 and not trial.is_lost_at_end and trial.n_particles == 7
+    never = evaluate_recovery([Reported(wrong, True)] * 40, truth)
+    assert never.found_s == np.inf and never.told_share == 1.0
+
+
+def test_displaced_poses_are_as_far_off_as_asked() -> None:
+    rng, pose = np.random.default_rng(1), np.array([3.0, 4.0, 0.5])
+    off = np.array([displace(pose, 20.0, 0.3, rng) for _ in range(50)]) - pose
+    np.testing.assert_allclose(np.hypot(off[:, 0], off[:, 1]), 20.0)
+    assert set(np.round(off[:, 2], 9)) == {-0.3, 0.3} and np.ptp(np.arctan2(off[:, 1], off[:, 0])) > 4.0
+
+
+def test_outliers_are_as_many_as_asked() -> None:
+    route = RouteSession("09", np.zeros((4001, 3)), np.zeros((4000, 3)))
+    steps = add_outliers(route, 0.05, np.random.default_rng(2)).increments
+    lengths = np.hypot(steps[:, 0], steps[:, 1])
+    assert np.mean(lengths > 0.0) == pytest.approx(0.05, abs=0.01)
+    assert lengths[lengths > 0.0].min() >= 0.5 and lengths.max() <= 2.0 and not route.increments.any()
+
+
+@pytest.mark.slow
+def test_the_real_route_is_held_and_found_again(real_root: Path) -> None:
+    experiment = prepare_experiment(real_root, "02", FrontEnd(), max_scans=400)
+    clouds = sample_session(experiment, 1)
+    disturbed = add_outliers(experiment.session, 0.015, np.random.default_rng(1))
+    for part in (experiment, type(experiment)(**{**vars(experiment), "session": disturbed})):
+        run = run_method(part, "robust", clouds, 1)
+        errors = pose_errors(run.poses, experiment.session.truth)
+        assert rmse(errors.position_m) < 0.3 and not run.failures and run.is_lost.mean() < 0.1
+    paper = run_method(experiment, "paper", clouds, 1)
+    assert np.isnan(paper.normalized_score).all() and not paper.is_lost.any() and len(paper.poses) == 400
+    trial, updates, heard = kidnap(experiment, 300, 1)
+    assert trial.found_s <= 10.0 and trial.told_share > 0.8 and len(updates) == len(heard) == 60

@@ -1,0 +1,407 @@
+"""The staging of the book: its settings where the address of the repository is known, and the pages' own extension."""
+
+import ast
+import base64
+import importlib.util
+import itertools
+import re
+import shutil
+import sys
+from pathlib import Path
+from types import ModuleType, SimpleNamespace
+
+import nbformat
+import pytest
+import yaml
+from nbformat.v4 import new_notebook
+
+import chapters
+import stage_book
+import toolbox_pages
+from chapters import CHAPTERS, NOTEBOOKS, ChapterError
+
+ROOT = Path(__file__).resolve().parents[2]
+KNOWN = {"ROL_REPOSITORY_URL": "https://git.example.org/people/radar.git"}
+
+
+@pytest.fixture
+def book(tmp_path: Path) -> Path:
+    (tmp_path / "_config.yml").write_text(
+        (ROOT / "book/_config.yml").read_text(encoding="utf-8"), encoding="utf-8"
+    )
+    return tmp_path
+
+
+def test_only_a_staged_book_is_removed(tmp_path: Path) -> None:
+    (tmp_path / "_build" / "html").mkdir(parents=True)  # the workflow makes the folder of its output
+    stage_book.clear(tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == ["made.md"]
+    (tmp_path / "intro.md").touch()
+    stage_book.clear(tmp_path)
+    assert not (tmp_path / "intro.md").exists()
+    (tmp_path / "made.md").rename(tmp_path / "thesis.md")
+    with pytest.raises(ChapterError, match="holds files but no made.md"):
+        stage_book.clear(tmp_path)
+    (tmp_path / "made.md").write_text("# How I made it", encoding="utf-8")
+    with pytest.raises(ChapterError, match="holds files but no made.md of this program"):
+        stage_book.clear(tmp_path)
+    assert (tmp_path / "thesis.md").is_file()
+
+
+def test_links_are_neither_removed_nor_followed(tmp_path: Path) -> None:
+    staged, link = tmp_path / "staged", tmp_path / "link"
+    stage_book.clear(staged)
+    link.symlink_to(staged)
+    with pytest.raises(ChapterError, match="link: a symbolic link"):
+        stage_book.clear(link)
+    (staged / "made.md").rename(tmp_path / "own.md")
+    (staged / "own").symlink_to(tmp_path)
+    with pytest.raises(ChapterError, match="no made.md"):
+        stage_book.clear(staged)
+    assert (staged / "own").is_symlink()
+
+
+@pytest.fixture(scope="module")
+def quiet_pages() -> ModuleType:
+    spec = importlib.util.spec_from_file_location("quiet_pages", ROOT / "book/_ext/quiet_pages.py")
+    module = importlib.util.module_from_spec(spec)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sys, "dont_write_bytecode", True)  # every file below book/ is an input of the book
+        spec.loader.exec_module(module)
+    return module
+
+
+# ---- settings -------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("environment", [{}, {"ROL_REPOSITORY_URL": ""}, {"ROL_REPOSITORY_BRANCH": "next"}])
+def test_without_an_address_the_settings_stay_as_they_are(book: Path, environment: dict) -> None:
+    before = (book / "_config.yml").read_text(encoding="utf-8")
+    stage_book.stage_settings(book, environment)
+    assert (book / "_config.yml").read_text(encoding="utf-8") == before
+    assert not {"repository", "launch_buttons"} & set(yaml.safe_load(before))
+
+
+def test_with_an_address_the_book_gets_a_button_for_binder(book: Path) -> None:
+    before = yaml.safe_load((book / "_config.yml").read_text(encoding="utf-8"))
+    stage_book.stage_settings(book, KNOWN)
+    after = yaml.safe_load((book / "_config.yml").read_text(encoding="utf-8"))
+    assert after == before | {
+        "repository": {"url": "https://git.example.org/people/radar", "branch": "main"},
+        "launch_buttons": {"notebook_interface": "jupyterlab", "binderhub_url": "https://mybinder.org"},
+    }
+
+
+def test_branch_and_hub_can_be_named() -> None:
+    more = {"ROL_REPOSITORY_BRANCH": "next", "ROL_BINDERHUB_URL": "https://hub.example.org/"}
+    settings = stage_book.launch_settings(KNOWN | more)
+    assert settings["repository"]["branch"] == "next"
+    assert settings["launch_buttons"]["binderhub_url"] == "https://hub.example.org"
+
+
+@pytest.mark.parametrize(
+    ("name", "address"),
+    [
+        ("ROL_REPOSITORY_URL", "git@git.example.org:people/radar.git"),
+        ("ROL_REPOSITORY_URL", "../radar"),
+        ("ROL_BINDERHUB_URL", "hub.example.org"),
+    ],
+)
+def test_address_that_no_browser_opens_is_refused(name: str, address: str) -> None:
+    with pytest.raises(ChapterError, match=name):
+        stage_book.launch_settings(KNOWN | {name: address})
+
+
+def test_staged_settings_pass_the_check_of_the_book(book: Path) -> None:
+    config = pytest.importorskip("jupyter_book.config")
+    stage_book.stage_settings(book, KNOWN)
+    config.validate_yaml(
+        yaml.safe_load((book / "_config.yml").read_text(encoding="utf-8")), raise_on_errors=True
+    )
+
+
+def test_binder_finds_what_the_button_needs() -> None:
+    environment = yaml.safe_load((ROOT / "environment.yml").read_text(encoding="utf-8"))
+    assert any(str(part).startswith("python=3.1") for part in environment["dependencies"])
+    assert {"-r requirements.lock", "-e ."} <= set(environment["dependencies"][-1]["pip"])
+    # With a folder of this name Binder would read that, and not the file.
+    assert not (ROOT / "binder").exists() and not (ROOT / ".binder").exists()
+    assert all((NOTEBOOKS / f"{chapter}.ipynb").is_file() for chapter in CHAPTERS)
+
+
+# ---- files that macOS leaves ----------------------------------------------------------------------------------
+
+
+def test_metadata_files_of_macos_are_passed_over(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    package, pages = tmp_path / "src/rol", tmp_path / "book"
+    shutil.copytree(ROOT / "src/rol", package, ignore=shutil.ignore_patterns("__pycache__"))
+    shutil.copytree(ROOT / "book", pages, ignore=shutil.ignore_patterns("__pycache__"))
+    for folder, kind in itertools.product((package, pages, pages / "images"), ("md", "py")):
+        (folder / f"._x.{kind}").write_bytes(b"\0\5\x16\7\xff")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(chapters, "SOURCE", package.parent)
+    monkeypatch.setattr(toolbox_pages, "SOURCE", package.parent)
+    monkeypatch.setattr(stage_book, "ROOT", tmp_path)
+    for name in ("stage_notebooks", "stage_result_figure"):
+        monkeypatch.setattr(stage_book, name, lambda *_: None)
+    monkeypatch.setattr(stage_book, "how_made_page", lambda *_: "")
+    staged = stage_book.stage(str(ROOT / "config/smoke.yaml"))
+    assert (staged / "toolbox/rol/mcl.md").is_file() and (staged / "intro.md").is_file()
+    assert not list(staged.rglob("._*"))
+    assert chapters.stored_digest(new_notebook(), chapters.load_config(ROOT / "config/smoke.yaml"))
+
+
+# ---- the toolbox ----------------------------------------------------------------------------------------------
+
+
+def test_toolbox_has_a_page_for_each_package_and_module(tmp_path: Path) -> None:
+    text = "### [mcl](toolbox/rol/mcl.md)\n### [bev](toolbox/rol_other/bev.md)\n"
+    (tmp_path / "take.md").write_text(text, encoding="utf-8")
+    entries = stage_book.stage_toolbox(tmp_path)
+    pages = [page["file"] for entry in entries for page in (entry, *entry["sections"])]
+    staged = {
+        path.relative_to(tmp_path).with_suffix("").as_posix() for path in tmp_path.rglob("toolbox/**/*.md")
+    }
+    assert {*pages, "toolbox/index"} == staged and len(pages) == len(staged) - 1
+    files = [file for file in chapters.SOURCE.rglob("[!.]*.py") if not file.name.startswith("__")]
+    folders = {file.relative_to(chapters.SOURCE).parts[0] for file in files}
+    assert len(pages) == len(files) + len(folders)
+    for folder in folders:  # Sphinx gives a package without one no place to link to
+        init = chapters.SOURCE / folder / "__init__.py"
+        assert ast.get_docstring(ast.parse(init.read_text(encoding="utf-8"))), f"{init}: no docstring"
+    page = (tmp_path / "toolbox/rol/mcl.md").read_text(encoding="utf-8")
+    assert "# rol.mcl\n" in page and "File: `src/rol/mcl.py`. [Example" in page
+    assert "(../../take.md#mcl)" in page
+    assert ".. autofunction:: localize\n" in page and ".. autoclass:: MclSettings\n   :members:" in page
+    assert "take.md" not in (tmp_path / "toolbox/rol/bev.md").read_text(encoding="utf-8")
+
+
+# ---- the pages' own extension ---------------------------------------------------------------------------------
+
+
+def script(name: str | None, body: str | None = None) -> SimpleNamespace:
+    return SimpleNamespace(filename=name, attributes={"body": body} if body else {})
+
+
+def test_page_keeps_each_script_once_and_none_of_thebe(quiet_pages: ModuleType) -> None:
+    scripts = [
+        script("a.js"),
+        script(None, "const THEBE_JS_URL = 1"),
+        script("sphinx-thebe.js"),
+        script("b.js"),
+    ]
+    context = {
+        "script_files": [*scripts, script("a.js"), script(None, "var a"), script(None, "var a")],
+        "css_files": [SimpleNamespace(filename="sphinx-thebe.css"), SimpleNamespace(filename="book.css")],
+    }
+    quiet_pages.leave_out_scripts(None, "intro", "page.html", context, None)
+    assert [(one.filename, one.attributes.get("body")) for one in context["script_files"]] == [
+        ("a.js", None),
+        ("b.js", None),
+        (None, "var a"),
+    ]
+    assert [sheet.filename for sheet in context["css_files"]] == ["book.css"]
+
+
+@pytest.mark.parametrize(
+    ("page", "notebook"),
+    [
+        ("07_localization-sim-town-seq02", "07_localization"),
+        ("07_localization-2019-01-10-12-32-52-radar-oxford-10k-paper", "07_localization"),
+        ("03_ground_removal", "03_ground_removal"),
+    ],
+)
+def test_button_opens_the_stored_notebook(quiet_pages: ModuleType, page: str, notebook: str) -> None:
+    start = "https://hub.example.org/v2/gh/people/radar/main?urlpath=lab/tree/notebooks/"
+    button, download = {"url": f"{start}{page}.ipynb"}, {"url": f"../_sources/notebooks/{page}.ipynb"}
+    context = {"header_buttons": [{"type": "group", "buttons": [button]}, download]}
+    quiet_pages.point_to_stored(None, "any", "page.html", context, None)
+    assert button["url"] == f"{start}{notebook}.ipynb"
+    assert download["url"] == f"../_sources/notebooks/{page}.ipynb"
+
+
+def test_finished_pages_are_cleaned(quiet_pages: ModuleType, tmp_path: Path) -> None:
+    (tmp_path / "a.html").write_text(
+        '<head>\n<link rel="preload" as="font" crossorigin href="f.woff2" />\n<link rel="stylesheet" href="a.css">\n'
+        '<script src="_static/vendor/fontawesome/6.5.2/js/all.min.js?digest=1"></script>\n<script src="a.js"></script>'
+        '</head><p><span class="pasted-text">`rol` is better than `paper`</span> `as it stands`</p>',
+        encoding="utf-8",
+    )
+    twice = '<input id="search-input"><input id="search-input">'
+    (tmp_path / "search.html").write_text(twice, encoding="utf-8")
+    app = SimpleNamespace(outdir=tmp_path, builder=SimpleNamespace(format="html"))
+    quiet_pages.clean_pages(app, None)
+    code = '<code class="docutils literal notranslate">{}</code>'
+    assert (tmp_path / "a.html").read_text(encoding="utf-8") == (
+        '<head>\n<link rel="stylesheet" href="a.css">\n<script src="a.js"></script></head><p><span class="pasted-text">'
+        f"{code.format('rol')} is better than {code.format('paper')}</span> `as it stands`</p>"
+    )
+    assert (tmp_path / "search.html").read_text(encoding="utf-8") == (
+        '<input id="search-input"><input id="search-input-of-page">'
+    )
+    (tmp_path / "search.html").write_text(twice, encoding="utf-8")
+    quiet_pages.clean_pages(app, RuntimeError("the build has failed"))
+    assert (tmp_path / "search.html").read_text(encoding="utf-8") == twice
+
+
+def test_default_that_is_made_anew_is_shown_as_dots(quiet_pages: ModuleType) -> None:
+    words = ("class", "rol.x.X", None, {})
+    shown = quiet_pages.readable_defaults(None, *words, "(a: list = <factory>, b: int = 1)", "X")
+    assert shown == ("(a: list = ..., b: int = 1)", "X")
+    assert quiet_pages.readable_defaults(None, *words, None, None) == (None, None)
+
+
+# ---- links and the first picture ------------------------------------------------------------------------------
+
+
+def test_links_lead_to_pages_and_commands_keep_the_file() -> None:
+    pages = {"07_localization-seq01": SimpleNamespace(chapter="07_localization")}
+    pages |= {
+        chapter: SimpleNamespace(chapter=chapter) for chapter in CHAPTERS if chapter != "07_localization"
+    }
+    told = stage_book.point_to_pages(
+        "[a](notebooks/07_localization.ipynb) [b](07_localization.ipynb#x) {glue:text}`07_localization.ipynb::rmse:.2f`\n"
+        "papermill notebooks/07_localization.ipynb out.ipynb; my_07_localization.ipynb; [c](08_results.ipynb)",
+        pages,
+    )
+    assert told == (
+        "[a](notebooks/07_localization-seq01.ipynb) [b](07_localization-seq01.ipynb#x) "
+        "{glue:text}`07_localization-seq01.ipynb::rmse:.2f`\n"
+        "papermill notebooks/07_localization.ipynb out.ipynb; my_07_localization.ipynb; [c](08_results.ipynb)"
+    )
+
+
+def write_run(path: Path, figure: str, png: bytes | None) -> SimpleNamespace:
+    outputs = (
+        [nbformat.v4.new_output("display_data", {"image/png": base64.b64encode(png).decode()})] if png else []
+    )
+    cell = nbformat.v4.new_code_cell("", outputs=outputs, metadata={"mystnb": {"figure": {"name": figure}}})
+    nbformat.write(nbformat.v4.new_notebook(cells=[cell]), path)
+    return SimpleNamespace(chapter=path.stem, path=lambda out_dir: path)
+
+
+@pytest.mark.parametrize(("real", "words"), [(b"real", "real.md"), (None, "simulated.md")])
+def test_first_picture_is_real_where_it_can_be(
+    book: Path, monkeypatch: pytest.MonkeyPatch, real: bytes | None, words: str
+) -> None:
+    (book / "images").mkdir()
+    for name in ("real.md", "simulated.md"):
+        (book / "images" / name).write_text(name, encoding="utf-8")
+    pngs = {"10_real_radar": real, "07_localization": b"simulated"}
+    runs = {c: write_run(book / f"{c}.ipynb", f, pngs[c]) for c, f, _ in stage_book.RESULT_FIGURES}
+    monkeypatch.setattr(chapters, "book_pages", lambda config: runs)
+    stage_book.stage_result_figure({"out_dir": ""}, book)
+    assert (book / "images" / "result.png").read_bytes() == (real or b"simulated")
+    assert (book / "picture.md").read_text(encoding="utf-8") == words
+
+
+def test_book_without_a_first_picture_is_refused(book: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    runs = {"07": write_run(book / "07_localization.ipynb", "fig-trajectory", None)}
+    monkeypatch.setattr(chapters, "book_pages", lambda config: runs)
+    with pytest.raises(ChapterError, match="no PNG figure named fig-trajectory"):
+        stage_book.stage_result_figure({"out_dir": ""}, book)
+
+
+# ---- what opens a chapter -------------------------------------------------------------------------------------
+
+
+def chapter_with(*figures: tuple[str, bytes | None, str | None]) -> nbformat.NotebookNode:
+    """A chapter with figures: name, picture, and the sentence that lets it open the chapter."""
+    cells = [
+        nbformat.v4.new_markdown_cell("# Title\n\nPurpose."),
+        nbformat.v4.new_code_cell("a = 1", metadata={"tags": ["parameters"]}),
+        nbformat.v4.new_code_cell("a = 2", metadata={"tags": ["injected-parameters"]}),
+    ]
+    for name, png, opening in figures:
+        metadata = {"mystnb": {"figure": {"name": name}, "image": {"alt": f"Alt of {name}"}}}
+        metadata |= {"opening": opening} if opening else {}
+        data = {"image/png": base64.b64encode(png).decode()} if png else {"text/plain": "nothing"}
+        output = nbformat.v4.new_output("display_data", data)
+        cells.append(nbformat.v4.new_code_cell("", outputs=[output], metadata=metadata))
+    return nbformat.v4.new_notebook(cells=cells)
+
+
+def test_chapter_opens_with_the_last_picture_that_was_drawn(tmp_path: Path) -> None:
+    notebook = chapter_with(
+        ("fig-a", b"a", None), ("fig-b", b"b", "B"), ("fig-c", b"c", "C ({kind} data)"), ("fig-d", None, "D")
+    )
+    stage_book.open_with_picture(notebook, tmp_path / "images", "05_chapter", "Simulated")
+    assert (tmp_path / "images/opening-05_chapter.png").read_bytes() == b"c"
+    lines = notebook.cells[0].source.split("\n")
+    assert lines[:3] == ["# Title", "", "Purpose."] and ":alt: Alt of fig-c" in lines
+    assert "```{image} ../images/opening-05_chapter.png" in lines
+    assert "C (simulated data) ({numref}`fig-c`)." in lines
+
+
+def test_chapter_without_a_drawn_picture_opens_without_one(tmp_path: Path) -> None:
+    notebook = chapter_with(("fig-a", b"a", None), ("fig-b", None, "B"))
+    stage_book.open_with_picture(notebook, tmp_path / "images", "09_chapter", "Real")
+    assert notebook.cells[0].source == "# Title\n\nPurpose." and not (tmp_path / "images").exists()
+
+
+def test_parameters_lie_behind_lines_that_name_them() -> None:
+    notebook = chapter_with()
+    stage_book.fold_parameters(notebook)
+    for cell, words in zip(notebook.cells[1:], ("parameters", "parameters of this run"), strict=True):
+        assert "hide-input" in cell.metadata["tags"]
+        assert cell.metadata["mystnb"]["code_prompt_show"] == f"Show the {words}"
+
+
+def test_every_chapter_has_a_figure_that_opens_it() -> None:
+    for chapter in CHAPTERS:
+        cells = nbformat.read(NOTEBOOKS / f"{chapter}.ipynb", as_version=4).cells
+        opening = [cell.metadata for cell in cells if "opening" in cell.metadata]
+        assert opening, chapter
+        for metadata in opening:
+            assert metadata["mystnb"]["figure"]["name"] and metadata["mystnb"]["image"]["alt"]
+            assert not metadata["opening"].rstrip().endswith(".")  # the reference to the figure follows
+
+
+# ---- captions -------------------------------------------------------------------------------------------------
+
+WORDS = {"real": r"\breal\b", "simulated": r"\bsimulated\b"}
+
+
+def figure_cell(caption: str, **metadata: str) -> nbformat.NotebookNode:
+    """A cell with a figure that shows nothing."""
+    metadata["mystnb"] = {"figure": {"name": "fig-a", "caption": caption}}
+    return nbformat.v4.new_code_cell("", metadata=metadata)
+
+
+@pytest.mark.parametrize(
+    ("caption", "data", "completed"),
+    [
+        ("Errors.", "session", "Errors. Real data."),
+        ("Errors ({glue:text}`kind` data).", "session", "Errors ({glue:text}`kind` data)."),
+        ("Errors of real RADIATE pairs.", "real", "Errors of real RADIATE pairs."),
+        ("Errors on the simulated route.", "simulated", "Errors on the simulated route."),
+        ("Real and simulated.", "both", "Real and simulated."),
+    ],
+)
+def test_only_captions_of_the_sessions_are_completed(caption: str, data: str, completed: str) -> None:
+    notebook = nbformat.v4.new_notebook(cells=[figure_cell(caption, data=data)])
+    stage_book.complete_captions(notebook, "Real")
+    assert notebook.cells[0].metadata.mystnb.figure.caption == completed
+
+
+@pytest.mark.parametrize("metadata", [{}, {"data": "virtual"}])
+def test_figure_that_does_not_state_its_data_is_refused(metadata: dict) -> None:
+    notebook = nbformat.v4.new_notebook(cells=[figure_cell("Errors.", **metadata)])
+    with pytest.raises(ChapterError, match="figure fig-a: `data` .* none of session, real, simulated, both"):
+        stage_book.complete_captions(notebook, "Real")
+
+
+@pytest.mark.parametrize("chapter", CHAPTERS)
+def test_every_caption_names_the_data_of_its_figure(chapter: str) -> None:
+    notebook = nbformat.read(NOTEBOOKS / f"{chapter}.ipynb", as_version=4)
+    stage_book.complete_captions(notebook, "Simulated")
+    for cell in notebook.cells:
+        figure = cell.metadata.get("mystnb", {}).get("figure", {})
+        if "caption" in figure:
+            data, caption = cell.metadata["data"], figure["caption"]
+            is_said = {name: bool(re.search(word, caption, re.IGNORECASE)) for name, word in WORDS.items()}
+            if data == "session":
+                assert (stage_book.GLUED_KIND in caption) != caption.endswith(" Simulated data."), caption
+            else:
+                assert all(is_said.values()) if data == "both" else is_said[data], caption
+                assert not caption.endswith((" Simulated data.", " Real data.")), caption
