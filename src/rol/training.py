@@ -80,7 +80,7 @@ class RunOptions:
     num_workers : int
         Threads that load pairs in advance.
     checkpoint_minutes : float
-        Longest time without a checkpoint [min], in addition to `TrainConfig.checkpoint_every`.
+        Longest time without a checkpoint [min], in addition to `rol.pix2pix.TrainConfig.checkpoint_every`.
     metadata : mapping
         More for the header of the weights file, JSON values only.
     """

@@ -62,7 +62,7 @@ def load_pairs(real_root: Path | str) -> list[RadiatePair]:
     Parameters
     ----------
     real_root : path
-        Folder of the real data, see `rall.find_real_root`.
+        Folder of the real data, see `rol_data.rall.find_real_root`.
 
     Returns
     -------

@@ -5,7 +5,7 @@ at that moment. Surfaces scatter by material, angle and a fixed texture of the w
 the power; smooth surfaces mirror rays, so that ghosts appear behind them. `radar_signal` turns the echoes
 into bytes.
 
-World frame as in `scene`; poses (x, y, yaw) in the plane, yaw counter-clockwise. The antenna turns clockwise,
+World frame as in `rol_sim.world.scene`; poses (x, y, yaw) in the plane, yaw counter-clockwise. The antenna turns clockwise,
 row 0 looks 0.836 deg to the right of forward.
 """
 
@@ -57,7 +57,7 @@ class RadarSettings:
     max_range : float
         Longest path looked at [m].
     noise_scale, streak_scale, interference_rate : float
-        See `radar_signal.echoes_to_codes`.
+        See `rol_sim.sensors.radar_signal.echoes_to_codes`.
     surfaces : dict
         Name of a material -> `Surface`, in place of the usual ones.
 

@@ -28,9 +28,9 @@ def label_sweep(folder: Path | str, sensor: str, stamp_us: int) -> tuple[np.ndar
     Returns
     -------
     points : array, shape (n, 4), float32
-        As `oxford.velodyne_raw_to_points` gives them: x, y, z [m] in the lidar frame, intensity.
+        As `rol.oxford.velodyne_raw_to_points` gives them: x, y, z [m] in the lidar frame, intensity.
     materials : array, shape (n,), uint8
-        `Material` of every point.
+        `rol_sim.world.mesh.Material` of every point.
 
     Raises
     ------

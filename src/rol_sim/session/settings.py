@@ -129,7 +129,7 @@ class SimulationSettings:
     world : str
         "town": a town drawn from the seed; "route": the world of the real lidar map, driven along real poses.
     real_root : str
-        World "route" only: folder of the real data; may be empty, see `rall.find_real_root`.
+        World "route" only: folder of the real data; may be empty, see `rol_data.rall.find_real_root`.
     unmapped_share : float
         World "route" only: things that the map does not show, as a fraction of the groups of cells that it shows.
     lidar, radar : dict
