@@ -27,11 +27,11 @@ from safetensors.torch import save
 from torch import Tensor, nn
 from torch.nn import functional
 
-try:
+if __package__:
     from .bev import normalize_image
     from .files import write_bytes
     from .geometry import check_fields
-except ImportError:  # this file was copied on its own
+else:  # this file was copied and is imported by its own name
     from bev import normalize_image
     from files import write_bytes
     from geometry import check_fields

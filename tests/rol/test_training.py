@@ -267,3 +267,20 @@ def test_runs_that_cannot_be_are_refused(
 ) -> None:
     with pytest.raises(ValueError, match=fault):
         train(pairs, config, tmp_path, seed=1)
+
+
+def test_checkpoint_of_other_hooks_is_refused(tmp_path: Path) -> None:
+    train(make_pairs(), TINY, tmp_path, seed=1, hooks=TrainHooks(settings={"pos_weight": 9.0}))
+    with pytest.raises(
+        TrainingError, match="last.safetensors: is of another run: pos_weight was 9.0, now None"
+    ):
+        train(make_pairs(), TINY, tmp_path, seed=1)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("num_workers", 0), ("num_workers", 1.5), ("checkpoint_minutes", float("nan")), ("resume", "no")],
+)
+def test_options_out_of_range_are_refused(name: str, value: object) -> None:
+    with pytest.raises(TrainingError, match=f"{name}: "):
+        RunOptions(**{name: value})
