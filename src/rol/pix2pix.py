@@ -655,22 +655,6 @@ def _restore_generator(path: str | Path, tensors: dict[str, Tensor], about: dict
     return generator
 
 
-def load_metadata(path: str | Path) -> dict[str, Any]:
-    """Read the header of a weights file: architecture, sizes, seed, settings, versions.
-
-    Parameters
-    ----------
-    path : path
-        File of `save_weights`.
-
-    Returns
-    -------
-    metadata : dict
-        Contents of the header.
-    """
-    return load_tensors(Path(path))[1]
-
-
 def save_tensors(path: Path, tensors: dict[str, Tensor], about: dict[str, Any]) -> None:
     """Write tensors and a header into a file that appears whole or not at all.
 

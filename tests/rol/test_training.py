@@ -13,7 +13,7 @@ import pytest
 torch = pytest.importorskip("torch")
 
 from rol import training
-from rol.pix2pix import TrainConfig, build_generator, load_metadata, load_weights
+from rol.pix2pix import TrainConfig, build_generator, load_tensors, load_weights
 from rol.training import RunOptions, TrainHooks, TrainingError, batch_indices, learning_rate, train
 
 pytestmark = pytest.mark.torch
@@ -114,7 +114,7 @@ def test_checkpoints_by_time_within_a_row_lead_to_the_same_bits(
     monkeypatch.setattr(training, "monotonic", partial(clock, count()))
     with pytest.raises(KeyboardInterrupt):
         train(pairs, config, tmp_path / "stopped", **settings)
-    about = load_metadata(tmp_path / "stopped" / "checkpoint" / "last.safetensors")
+    about = load_tensors(tmp_path / "stopped" / "checkpoint" / "last.safetensors")[1]
     assert (about["step"], len(about["history"])) == (saved_step, saved_step // 5)
     monkeypatch.undo()
     again = train(pairs, config, tmp_path / "stopped", **settings)[1]
@@ -156,7 +156,7 @@ def test_files_hold_what_was_done(tmp_path: Path) -> None:
     generator, history = train(
         make_pairs(), TINY, tmp_path, seed=1, options=RunOptions(metadata={"session": "s"})
     )
-    about = load_metadata(tmp_path / "generator.safetensors")
+    about = load_tensors(tmp_path / "generator.safetensors")[1]
     assert (about["session"], about["seed"], about["step"], about["pairs"]) == ("s", 1, 12, 5)
     assert about["config"]["lambda_l1"] == 100.0 and about["image_size"] == [32, 32]
     assert load_weights(tmp_path / "generator.safetensors").image_size == generator.image_size == (32, 32)
@@ -204,7 +204,7 @@ def test_loss_that_is_not_finite_names_the_step_and_leaves_the_checkpoint(tmp_pa
     )
     with pytest.raises(TrainingError, match=told):
         train(pairs, TINY, tmp_path, seed=1)
-    assert load_metadata(tmp_path / "checkpoint" / "last.safetensors")["step"] == 4
+    assert load_tensors(tmp_path / "checkpoint" / "last.safetensors")[1]["step"] == 4
     assert not (tmp_path / "generator.safetensors").exists()
 
 
