@@ -150,12 +150,19 @@ class TrainingState:
         pix2pix.save_tensors(path, tensors, {**about, **scalars})
 
     def load(self, path: Path, about: dict[str, Any]) -> None:
-        """Restore a checkpoint of the same run; refuse the checkpoint of another."""
+        """Restore a checkpoint of the same run; refuse the checkpoint of another, or a part of one."""
         tensors, found = pix2pix.load_tensors(path)
         for name, (then, now) in _differences(found, about).items():
             raise TrainingError(
                 f"{path}: is of another run: {name} was {then}, now {now}; delete it, or train with resume=False"
             )
+        try:
+            self._restore(tensors, found)
+        except (KeyError, RuntimeError) as error:
+            raise TrainingError(f"{path}: not a whole checkpoint ({error!r:.80}); delete it") from error
+
+    def _restore(self, tensors: dict[str, Tensor], found: dict[str, Any]) -> None:
+        """Take over networks, optimizers, step and history."""
         for name, network in self.networks.items():
             network.load_state_dict({key: tensors[f"{name}.{key}"] for key in network.state_dict()})
             states = {}

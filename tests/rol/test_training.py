@@ -13,7 +13,7 @@ import pytest
 torch = pytest.importorskip("torch")
 
 from rol import training
-from rol.pix2pix import TrainConfig, build_generator, load_tensors, load_weights
+from rol.pix2pix import TrainConfig, build_generator, load_tensors, load_weights, save_tensors
 from rol.training import RunOptions, TrainHooks, TrainingError, batch_indices, learning_rate, train
 
 pytestmark = pytest.mark.torch
@@ -192,6 +192,19 @@ def test_truncated_checkpoint_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "checkpoint" / "last.safetensors"
     path.write_bytes(path.read_bytes()[:-100])
     with pytest.raises(ValueError, match="last.safetensors: not a whole safetensors file"):
+        train(make_pairs(), TINY, tmp_path, seed=1)
+
+
+@pytest.mark.parametrize("part", ["generator.", "adam.discriminator.", "history"])
+def test_checkpoint_without_a_part_is_refused(tmp_path: Path, part: str) -> None:
+    train(make_pairs(), TINY, tmp_path, seed=1)
+    path = tmp_path / "checkpoint" / "last.safetensors"
+    tensors, about = (
+        {name: value for name, value in content.items() if not name.startswith(part)}
+        for content in load_tensors(path)
+    )
+    save_tensors(path, tensors, about)
+    with pytest.raises(TrainingError, match="last.safetensors: not a whole checkpoint"):
         train(make_pairs(), TINY, tmp_path, seed=1)
 
 
