@@ -5,8 +5,8 @@ at that moment. Surfaces scatter by material, angle and a fixed texture of the w
 the power; smooth surfaces mirror rays, so that ghosts appear behind them. `radar_signal` turns the echoes
 into bytes.
 
-World frame as in `rol_sim.world.scene`; poses (x, y, yaw) in the plane, yaw counter-clockwise. The antenna turns clockwise,
-row 0 looks 0.836 deg to the right of forward.
+World frame as in `rol_sim.world.scene`; poses (x, y, yaw) in the plane, yaw counter-clockwise. The antenna
+turns clockwise, row 0 looks 0.836 deg to the right of forward.
 """
 
 from __future__ import annotations
