@@ -32,7 +32,7 @@ def page_text(title: str, above: str, lines: list[str]) -> str:
 
 def table_of(docstrings: dict[str, str | None]) -> list[str]:
     """Write a table of full names, each linked and with the first sentence of its docstring."""
-    lines = [".. list-table::", "   :header-rows: 1", "", "   * - name", "     - what it is or does"]
+    lines = [".. list-table::", "   :header-rows: 1", "", "   * - name", "     - description"]
     for name, docstring in docstrings.items():
         paragraph = " ".join((docstring or "").split("\n\n")[0].split())
         sentence = re.split(r"(?<=[.?!]) (?=[A-Z])", paragraph)[0]
@@ -81,7 +81,9 @@ def stage_toolbox(book: Path) -> list[dict]:
         name = module_name(package)
         lines = [f".. automodule:: {name}", "", *table_of(docstrings_of(files))]
         write_text(book / f"{page_name(package)}.md", page_text(name, f"Folder: `src/{name}`.", lines))
-        sections = [{"file": page_name(file)} for file in files]
+        sections = [
+            {"file": page_name(file), "title": module_name(file).removeprefix(f"{name}.")} for file in files
+        ]
         entries.append({"file": page_name(package), "sections": sections})
     above = (
         "One page for each module, with signature, docstring and code of every public function and class."

@@ -1,1 +1,1 @@
-"""Readers of public data other than Oxford's radar sessions, RaLL and RADIATE; and fetching of public files."""
+"""Readers of public data other than Oxford's sessions (RaLL, RADIATE), and their download."""

@@ -2,11 +2,11 @@
 
 A fan of rays, a few per azimuth and height layer, is cast once per turn; each ray starts where the radar is
 at that moment. Surfaces scatter by material, angle and a fixed texture of the world; leaves transmit part of
-the power; smooth surfaces mirror rays, so that ghosts appear behind them. `radar_signal` turns the echoes
-into bytes.
+the power; smooth surfaces mirror rays, so that ghosts appear behind them.
+`rol_sim.sensors.radar_signal` turns the echoes into bytes.
 
-World frame as in `rol_sim.world.scene`; poses (x, y, yaw) in the plane, yaw counter-clockwise. The antenna turns clockwise,
-row 0 looks 0.836 deg to the right of forward.
+World frame as in `rol_sim.world.scene`; poses (x, y, yaw) in the plane, yaw counter-clockwise. The antenna
+turns clockwise, row 0 looks 0.836 deg to the right of forward.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Scattering of a 77 GHz radar by surfaces: diffuse, specular, corners, and transmission through leaves.
 
-World frame as in `rol_sim.world.scene`, metres. Every half metre of a wall has a reflectivity of its own, the same whenever
-it is seen, so that scans of one place resemble each other.
+World frame as in `rol_sim.world.scene`, metres. Every half metre of a wall has a reflectivity of its own,
+the same whenever it is seen, so that scans of one place resemble each other.
 """
 
 from __future__ import annotations

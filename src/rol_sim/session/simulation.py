@@ -1,7 +1,7 @@
 """Build simulated sessions in memory: world, trajectory, traffic, times, scans and sweeps.
 
-Every scan and sweep has a generator of its own, so each can be made alone and in any order; `writer` puts
-them on disk.
+Every scan and sweep has a generator of its own, so each can be made alone and in any order;
+`rol_sim.session.writer` writes them to disk.
 """
 
 from __future__ import annotations
