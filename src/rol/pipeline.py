@@ -73,6 +73,8 @@ def scan_to_points(network: TrainedNetwork, scan: Any) -> np.ndarray:
 class RadarLocalizer:
     """Localize radar scans on a lidar map, one at a time.
 
+    As in the paper, motion during a scan is not compensated; `rol_beyond.pipeline.RobustLocalizer` compensates it.
+
     Parameters
     ----------
     map_points : array, shape (m, 2)
