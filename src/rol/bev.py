@@ -11,9 +11,9 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-try:
+if __package__:
     from .geometry import check_points
-except ImportError:  # this file was copied on its own
+else:  # this file was copied and is imported by its own name
     from geometry import check_points
 
 

@@ -13,10 +13,10 @@ from pathlib import Path
 
 import numpy as np
 
-try:
+if __package__:
     from .files import read_text, write_text
     from .geometry import check_fields, check_poses, relative_pose
-except ImportError:  # this file was copied into a folder that is no package
+else:  # this file was copied and is imported by its own name
     from files import read_text, write_text
     from geometry import check_fields, check_poses, relative_pose
 

@@ -116,7 +116,8 @@ def check_fields(
     Parameters
     ----------
     settings : dataclass
-        Instance to check; fields declared as ``int`` must be whole numbers, tuples are checked value by value.
+        Instance to check; fields declared as ``int`` must be whole numbers, those declared as ``bool`` True or False;
+        tuples are checked value by value.
     allowed : mapping
         Range or choices -> names of the fields, separated by spaces. A range is written as an interval, such as
         "(0, inf)", where a bracket includes the bound; choices are a tuple of words.
@@ -129,6 +130,9 @@ def check_fields(
         Or the given ``error``, with the field's name, its value and what is allowed; NaN is in no range.
     """
     kinds = {field.name: str(field.type) for field in fields(settings)}
+    for name in (name for name, kind in kinds.items() if kind == "bool"):
+        if type(getattr(settings, name)) is not bool:
+            raise error(f"{name}: {getattr(settings, name)!r} is neither True nor False")
     for span, names in allowed.items():
         for name in names.split():
             value = getattr(settings, name)

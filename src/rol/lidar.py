@@ -9,9 +9,9 @@ from __future__ import annotations
 
 import numpy as np
 
-try:
+if __package__:
     from .geometry import transform_points_3d
-except ImportError:  # this file was copied on its own
+else:  # this file was copied and is imported by its own name
     from geometry import transform_points_3d
 
 

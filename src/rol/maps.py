@@ -16,11 +16,11 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial import cKDTree
 
-try:
+if __package__:
     from .files import write_bytes
     from .geometry import check_grid, check_points, check_poses, compose, transform_points
     from .odometry import IcpSettings, icp_2d
-except ImportError:  # this file was copied into a folder that is no package
+else:  # this file was copied and is imported by its own name
     from files import write_bytes
     from geometry import check_grid, check_points, check_poses, compose, transform_points
     from odometry import IcpSettings, icp_2d

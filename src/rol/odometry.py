@@ -13,10 +13,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-try:
+if __package__:
     from .compiled import compiled
     from .geometry import check_fields, check_points, check_poses
-except ImportError:  # this file was copied into a folder that is no package
+else:  # this file was copied and is imported by its own name
     from compiled import compiled
     from geometry import check_fields, check_points, check_poses
 

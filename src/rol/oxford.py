@@ -21,10 +21,10 @@ import cv2
 import numpy as np
 import pandas as pd
 
-try:
+if __package__:
     from .files import read_text
     from .geometry import accumulate_increments, check_points, transform_from_euler
-except ImportError:  # this file was copied on its own
+else:  # this file was copied and is imported by its own name
     from files import read_text
     from geometry import accumulate_increments, check_points, transform_from_euler
 

@@ -19,7 +19,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-try:
+if __package__:
     from .bev import image_to_points, normalize_image, points_to_image
     from .files import ImageFolder, write_bytes
     from .geometry import check_fields, log
@@ -34,7 +34,7 @@ try:
         deskew_points,
         polar_to_cartesian,
     )
-except ImportError:  # this file was copied on its own
+else:  # this file was copied and is imported by its own name
     from bev import image_to_points, normalize_image, points_to_image
     from files import ImageFolder, write_bytes
     from geometry import check_fields, log
@@ -420,14 +420,14 @@ def radar_to_image(
     """
     if settings.motion == "corrected" and twist is None:
         raise ValueError("motion 'corrected' needs a twist")
-    motion = ScanMotion(twist, doppler_seconds=settings.doppler_seconds)
+    is_corrected = settings.motion == "corrected"
     image = polar_to_cartesian(
         power,
         azimuths,
         calibration=RangeCalibration(settings.range_resolution, settings.range_offset),
         pixel_size=settings.pixel_size,
         width=settings.width,
-        motion=motion if settings.motion == "corrected" else None,
+        motion=ScanMotion(twist, doppler_seconds=settings.doppler_seconds) if is_corrected else None,
     )
     return np.rint(image * 255.0).astype(np.uint8)
 
@@ -657,6 +657,8 @@ def read_points(
     """
     images = generated_folder(folder)
     about = images.read()
+    if "points" not in about:
+        raise ValueError(f"{Path(folder) / images.listing}: the key 'points' is missing")
     if twists is None or about["settings"].get("pairs", {}).get("motion") == "corrected":
         twists = [None] * len(stamps_us)
     for stamp, twist in zip(stamps_us, twists, strict=True):

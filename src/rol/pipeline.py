@@ -7,13 +7,13 @@ from typing import Any
 
 import numpy as np
 
-try:
+if __package__:
     from .bev import image_to_points
     from .mcl import MclSettings, ParticleFilter
     from .odometry import icp_2d
     from .pix2pix import TrainedNetwork, generate
     from .radar import MEASURED, RangeCalibration, polar_to_cartesian
-except ImportError:  # this file was copied into a folder that is no package
+else:  # this file was copied and is imported by its own name
     from bev import image_to_points
     from mcl import MclSettings, ParticleFilter
     from odometry import icp_2d
@@ -72,6 +72,8 @@ def scan_to_points(network: TrainedNetwork, scan: Any) -> np.ndarray:
 
 class RadarLocalizer:
     """Localize radar scans on a lidar map, one at a time.
+
+    As in the paper, motion during a scan is not compensated; `rol_beyond.pipeline.RobustLocalizer` compensates it.
 
     Parameters
     ----------

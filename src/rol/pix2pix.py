@@ -27,11 +27,11 @@ from safetensors.torch import save
 from torch import Tensor, nn
 from torch.nn import functional
 
-try:
+if __package__:
     from .bev import normalize_image
     from .files import write_bytes
     from .geometry import check_fields
-except ImportError:  # this file was copied on its own
+else:  # this file was copied and is imported by its own name
     from bev import normalize_image
     from files import write_bytes
     from geometry import check_fields
@@ -653,22 +653,6 @@ def _restore_generator(path: str | Path, tensors: dict[str, Tensor], about: dict
     generator.tta_rotations = int(about.get("headings", 1))
     generator.eval().fuse()
     return generator
-
-
-def load_metadata(path: str | Path) -> dict[str, Any]:
-    """Read the header of a weights file: architecture, sizes, seed, settings, versions.
-
-    Parameters
-    ----------
-    path : path
-        File of `save_weights`.
-
-    Returns
-    -------
-    metadata : dict
-        Contents of the header.
-    """
-    return load_tensors(Path(path))[1]
 
 
 def save_tensors(path: Path, tensors: dict[str, Tensor], about: dict[str, Any]) -> None:

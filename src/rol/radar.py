@@ -13,10 +13,10 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-try:
-    from .geometry import exp
-except ImportError:  # this file was copied on its own
-    from geometry import exp
+if __package__:
+    from .geometry import check_fields, check_poses, exp
+else:  # this file was copied and is imported by its own name
+    from geometry import check_fields, check_poses, exp
 
 DOPPLER_SECONDS = 0.049  # a target ahead reads nearer by this time multiplied by the closing speed
 SCAN_SECONDS = 0.25  # one turn
@@ -32,10 +32,18 @@ class RangeCalibration:
     ----------
     resolution_m, offset_m : float
         Length of a bin, and offset of all ranges [m].
+
+    Raises
+    ------
+    ValueError
+        If a value is out of its range; the message names it.
     """
 
     resolution_m: float
     offset_m: float = 0.0
+
+    def __post_init__(self) -> None:
+        check_fields(self, {"(0, inf)": "resolution_m", "(-inf, inf)": "offset_m"})
 
 
 SDK = RangeCalibration(0.0432)  # of the data set's SDK
@@ -54,11 +62,20 @@ class ScanMotion:
         Time of one turn, spread evenly over the rows [s].
     doppler_seconds : float
         Ranges read nearer by this time multiplied by the closing speed [s].
+
+    Raises
+    ------
+    ValueError
+        If a value is out of its range; the message names it.
     """
 
     twist: np.ndarray | tuple[float, float, float]
     scan_seconds: float = SCAN_SECONDS
     doppler_seconds: float = DOPPLER_SECONDS
+
+    def __post_init__(self) -> None:
+        check_fields(self, {"(0, inf)": "scan_seconds", "(-inf, inf)": "doppler_seconds"})
+        check_poses(self.twist, "twist")
 
 
 def polar_to_cartesian(

@@ -20,12 +20,14 @@ import pandas as pd
 import torch
 from torch import Tensor, nn
 
-try:
+if __package__:
     from . import pix2pix
     from .files import write_text
-except ImportError:  # this file was copied on its own
+    from .geometry import check_fields
+else:  # this file was copied and is imported by its own name
     import pix2pix
     from files import write_text
+    from geometry import check_fields
 
 HISTORY_COLUMNS = ["step", "epoch", "learning_rate", "loss_d", "loss_gan", "loss_l1", "held_out_l1"]
 
@@ -80,9 +82,14 @@ class RunOptions:
     num_workers : int
         Threads that load pairs in advance.
     checkpoint_minutes : float
-        Longest time without a checkpoint [min], in addition to `TrainConfig.checkpoint_every`.
+        Longest time without a checkpoint [min], in addition to `rol.pix2pix.TrainConfig.checkpoint_every`.
     metadata : mapping
         More for the header of the weights file, JSON values only.
+
+    Raises
+    ------
+    TrainingError
+        If a value is out of its range; the message names it.
     """
 
     resume: bool = True
@@ -90,6 +97,9 @@ class RunOptions:
     num_workers: int = 1
     checkpoint_minutes: float = 10.0
     metadata: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        check_fields(self, {"[1, inf)": "num_workers", "[0, inf]": "checkpoint_minutes"}, TrainingError)
 
 
 class TrainingState:
@@ -140,12 +150,19 @@ class TrainingState:
         pix2pix.save_tensors(path, tensors, {**about, **scalars})
 
     def load(self, path: Path, about: dict[str, Any]) -> None:
-        """Restore a checkpoint of the same run; refuse the checkpoint of another."""
+        """Restore a checkpoint of the same run; refuse the checkpoint of another, or a part of one."""
         tensors, found = pix2pix.load_tensors(path)
         for name, (then, now) in _differences(found, about).items():
             raise TrainingError(
                 f"{path}: is of another run: {name} was {then}, now {now}; delete it, or train with resume=False"
             )
+        try:
+            self._restore(tensors, found)
+        except (KeyError, RuntimeError) as error:
+            raise TrainingError(f"{path}: not a whole checkpoint ({error!r:.80}); delete it") from error
+
+    def _restore(self, tensors: dict[str, Tensor], found: dict[str, Any]) -> None:
+        """Take over networks, optimizers, step and history."""
         for name, network in self.networks.items():
             network.load_state_dict({key: tensors[f"{name}.{key}"] for key in network.state_dict()})
             states = {}
@@ -354,7 +371,9 @@ def _checksum(pairs: Any) -> int:
 def _differences(found: dict[str, Any], wanted: dict[str, Any]) -> dict[str, tuple[Any, Any]]:
     """List what differs, settings by their own names: name to (found, wanted)."""
     sides = [{**about, **(about.get("config") or {})} for about in (found, wanted)]
-    names = [name for name in sides[1] if name != "config"]
+    names = [name for name in {**sides[1], **(found.get("config") or {})} if name != "config"]
     return {
-        name: (sides[0].get(name), sides[1][name]) for name in names if sides[0].get(name) != sides[1][name]
+        name: (sides[0].get(name), sides[1].get(name))
+        for name in names
+        if sides[0].get(name) != sides[1].get(name)
     }

@@ -16,7 +16,7 @@ def error_figures(errors: PoseErrors) -> dict[str, float]:
     Parameters
     ----------
     errors : PoseErrors
-        From `pose_errors`.
+        From `rol.evaluation.pose_errors`.
 
     Returns
     -------

@@ -27,10 +27,8 @@ if TYPE_CHECKING:
 DETECTORS = ("k-strongest", "cfar")
 MIN_RANGE_M = 2.5  # the radar's own leakage is nearer than this [m]
 MAX_RANGE_M = 64.0  # radius of the images [m]
-K_STRONGEST, MIN_POWER = (
-    12,
-    70,
-)  # peaks per azimuth, and the weakest power that counts, 35 dB in half-dB steps
+K_STRONGEST = 12  # peaks per azimuth
+MIN_POWER = 70  # weakest power that counts: 35 dB in half-dB steps
 
 
 def generate_points(

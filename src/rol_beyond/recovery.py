@@ -398,8 +398,8 @@ class RecoveringFilter:
     start : array-like, shape (3,)
         Pose T_map_radar at the first scan [m, m, rad]; it may be wrong.
     settings : MclSettings
-        Of the filter, such as ``rol_beyond.robust.settings_for("robust", motion=MotionModel())``. The motion is a
-        `MotionModel` and the resampling a `KldResampling`.
+        Of the filter, such as ``rol_beyond.robust.settings_for("robust", motion=MotionModel())``. The motion may be a
+        `MotionModel`, and the resampling a `KldResampling`.
     recovery : RecoverySettings
         Detection, search and confirmation.
     rng : numpy.random.Generator
@@ -563,7 +563,7 @@ class RecoveringFilter:
     def _promote(self, winner: int) -> None:
         """Replace the filter's particles and scores by those of a hypothesis."""
         particles, weights = self.hypotheses.particles[winner], self.hypotheses.weights[winner]
-        n = max(self.settings.resampling.min_particles, len(particles))
+        n = max(getattr(self.settings.resampling, "min_particles", 0), len(particles))
         chosen = self.rng.choice(len(particles), n, p=weights)
         self.particles, self.weights = particles[chosen], np.full(n, 1.0 / n)
         self.scores.extend(self.hypotheses.scores[winner].tolist())

@@ -45,7 +45,7 @@ class RealScan:
     stamp_us : int
         Time of its first row [us].
     power, azimuths : array, shape (400, b) and (400,)
-        Power power, and counter-clockwise bearings of the rows [rad].
+        Power in half-dB steps, and counter-clockwise bearings of the rows [rad].
     pose : array, shape (3,)
         Pose of the radar at mid-scan in the frame of the map [m, m, rad].
     twist : tuple of float, or None

@@ -402,7 +402,7 @@ def map_fractions(
     within_m: tuple[float, ...] = (1.0, 2.0),
     *,
     k: int = 12,
-    min_code: int = 70,
+    min_power: int = 70,
     max_range_m: float = 64.0,
 ) -> np.ndarray:
     """Compute the fraction of raw radar peaks that lie near a map point, scan by scan.
@@ -417,7 +417,7 @@ def map_fractions(
         Points of the map [m].
     within_m : tuple of float
         Distances [m].
-    k, min_code, max_range_m : int, int, float
+    k, min_power, max_range_m : int, int, float
         The detector: strongest peaks per azimuth, weakest code, farthest range [m]; no network, no correction
         of motion.
 
@@ -432,7 +432,7 @@ def map_fractions(
             scan,
             beam_azimuths(),
             k,
-            min_code,
+            min_power,
             range_limits_m=(2.5, max_range_m),
             calibration=MEASURED,
         )

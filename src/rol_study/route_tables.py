@@ -271,12 +271,21 @@ def load_truth(real_root: str, number: str) -> np.ndarray:
 def run_table(
     pool: ProcessPoolExecutor, what: str, jobs: list[tuple], path: Path, *, real_root: str, weights: str
 ) -> None:
-    """Run the jobs that the table of a file lacks, and write the table after each."""
+    """Run the jobs that the table of a file lacks, and write the table after each.
+
+    Raises
+    ------
+    ValueError
+        If the table holds jobs that are not listed, such as those of another set of sessions; nothing is dropped.
+    """
     table = (
         pd.read_csv(path, dtype={"session": str, "job": str}) if path.is_file() else pd.DataFrame({"job": []})
     )
     wanted = [" ".join(map(str, key)) for key in jobs]
-    table = table[table.job.isin(wanted)]
+    if unlisted := sorted(set(table.job) - set(wanted)):
+        raise ValueError(
+            f"{path}: {len(unlisted)} jobs are not listed, such as {unlisted[0]!r}; move the file away"
+        )
     missing = [key for key, name in zip(jobs, wanted, strict=True) if name not in set(table.job)]
     running = [pool.submit(measure, real_root, weights, what, key) for key in missing]
     for done, future in enumerate(as_completed(running), start=1):

@@ -144,7 +144,9 @@ def executable() -> str:
     """The browser; without one the tests skip."""
     found = find_chromium()
     if found is None:
-        pytest.skip("no Chromium: install `chromium`, or name one in the environment variable ROL_CHROMIUM")
+        pytest.skip(
+            "no Chromium: install `chromium` (and `libatomic1`), or name one in the environment variable ROL_CHROMIUM"
+        )
     return found
 
 
@@ -426,6 +428,9 @@ def test_page_that_is_not_there_is_an_error(tmp_path: Path, tab: Tab) -> None:
         tab.open((tmp_path / "nowhere.html").as_uri(), WIDE)
 
 
+@pytest.mark.usefixtures(
+    "executable"
+)  # Playwright's driver needs one of the libraries that come with a browser
 def test_browser_that_does_not_start_says_so(tmp_path: Path) -> None:
     program = tmp_path / "broken"
     program.write_text("#!/bin/sh\necho no display today\n", encoding="utf-8")

@@ -292,3 +292,13 @@ def test_entries_for_citing_are_those_of_the_bibliography() -> None:
     assert citation["title"] in book and citation["authors"][0]["name"] in book
     paper = citation["preferred-citation"]
     assert paper["title"] in entries[0] and str(paper["year"]) in entries[0]
+
+
+@pytest.mark.parametrize(("module", "missing"), [("mcl", "numba"), ("pipeline", "torch")])
+def test_a_missing_package_is_named(module: str, missing: str) -> None:
+    code = f"import sys; sys.modules[{missing!r}] = None; import rol.{module}"
+    environment = {**os.environ, "PYTHONPATH": str(ROOT / "src")}
+    answer = subprocess.run(
+        [sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=False
+    )
+    assert f"import of {missing} halted" in answer.stderr.splitlines()[-1]

@@ -1,5 +1,7 @@
 """Poses in the plane and in space, with numbers worked out by hand."""
 
+from dataclasses import dataclass
+
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
@@ -153,3 +155,14 @@ def test_first_of_cells_by_hand():
     points = np.array([[0.1, 0.1], [-0.1, 0.1], [0.2, 0.05], [5.0, 5.0], [0.1, 0.1], [5.1, 5.2]])
     np.testing.assert_array_equal(geometry.first_of_cells(points, 0.25), points[[0, 1, 3]])
     assert geometry.first_of_cells(np.zeros((0, 2)), 0.25).shape == (0, 2)
+
+
+def test_flags_must_be_true_or_false():
+    @dataclass
+    class Flags:
+        on: "bool" = False
+
+    geometry.check_fields(Flags(True), {})
+    for value in ("no", 1, None):
+        with pytest.raises(ValueError, match="on: .* is neither True nor False"):
+            geometry.check_fields(Flags(value), {})

@@ -352,3 +352,12 @@ def test_dataset(tmp_path):
     with pytest.raises(IndexError):
         dataset[3]
     assert Path(pairs.__file__).read_text(encoding="utf-8").count("import torch") == 0
+
+
+def test_listing_without_points_is_named(tmp_path):
+    folder = pairs.generated_folder(tmp_path)
+    folder.prepare({})
+    pairs.save_image(folder.path(1), np.zeros((8, 8), np.uint8))
+    folder.finish({}, [1])
+    with pytest.raises(ValueError, match=r"fake\.json: the key 'points' is missing"):
+        list(pairs.read_points(tmp_path, [1]))

@@ -25,8 +25,8 @@ from rol.pix2pix import (
     gan_loss,
     generate,
     l1_loss,
-    load_metadata,
     load_network,
+    load_tensors,
     load_weights,
     receptive_field,
     register_architecture,
@@ -375,7 +375,7 @@ def test_weights_come_back_with_what_they_are(weights: Path) -> None:
     np.testing.assert_array_equal(
         generate(generator, radar_image()), generate(tiny_generator(), radar_image())
     )
-    about = load_metadata(weights)
+    about = load_tensors(weights)[1]
     assert about["seed"] == 1 and about["config"] == {"steps": 3}
     assert about["architecture"] == ResnetGenerator.description and about["torch"] == torch.__version__
 

@@ -313,3 +313,26 @@ def test_peaks_refuse_azimuths_that_rise():
 def test_calibrations():
     assert (SDK.resolution_m, SDK.offset_m) == (0.0432, 0.0)
     assert (MEASURED.resolution_m, MEASURED.offset_m) == (0.0438, -0.31)
+
+
+@pytest.mark.parametrize("name", ["resolution_m", "offset_m"])
+@pytest.mark.parametrize("value", [math.nan, math.inf, "0.04", None])
+def test_calibrations_out_of_range_are_refused(name, value):
+    with pytest.raises(ValueError, match=f"{name}: "):
+        radar.RangeCalibration(**{"resolution_m": 0.0438, name: value})
+    with pytest.raises(ValueError, match="resolution_m: 0.0 is not in"):
+        radar.RangeCalibration(0.0)
+
+
+@pytest.mark.parametrize(
+    ("change", "fault"),
+    [
+        ({"twist": (1.0, 0.0)}, "twist: expected shape"),
+        ({"twist": (1.0, math.nan, 0.0)}, "twist: value at index"),
+        ({"scan_seconds": 0.0}, "scan_seconds: 0.0 is not in"),
+        ({"doppler_seconds": math.nan}, "doppler_seconds: nan is not in"),
+    ],
+)
+def test_motions_out_of_range_are_refused(change, fault):
+    with pytest.raises(ValueError, match=fault):
+        radar.ScanMotion(**{"twist": (1.0, 0.0, 0.0), **change})

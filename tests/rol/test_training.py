@@ -13,7 +13,7 @@ import pytest
 torch = pytest.importorskip("torch")
 
 from rol import training
-from rol.pix2pix import TrainConfig, build_generator, load_metadata, load_weights
+from rol.pix2pix import TrainConfig, build_generator, load_tensors, load_weights, save_tensors
 from rol.training import RunOptions, TrainHooks, TrainingError, batch_indices, learning_rate, train
 
 pytestmark = pytest.mark.torch
@@ -114,7 +114,7 @@ def test_checkpoints_by_time_within_a_row_lead_to_the_same_bits(
     monkeypatch.setattr(training, "monotonic", partial(clock, count()))
     with pytest.raises(KeyboardInterrupt):
         train(pairs, config, tmp_path / "stopped", **settings)
-    about = load_metadata(tmp_path / "stopped" / "checkpoint" / "last.safetensors")
+    about = load_tensors(tmp_path / "stopped" / "checkpoint" / "last.safetensors")[1]
     assert (about["step"], len(about["history"])) == (saved_step, saved_step // 5)
     monkeypatch.undo()
     again = train(pairs, config, tmp_path / "stopped", **settings)[1]
@@ -156,7 +156,7 @@ def test_files_hold_what_was_done(tmp_path: Path) -> None:
     generator, history = train(
         make_pairs(), TINY, tmp_path, seed=1, options=RunOptions(metadata={"session": "s"})
     )
-    about = load_metadata(tmp_path / "generator.safetensors")
+    about = load_tensors(tmp_path / "generator.safetensors")[1]
     assert (about["session"], about["seed"], about["step"], about["pairs"]) == ("s", 1, 12, 5)
     assert about["config"]["lambda_l1"] == 100.0 and about["image_size"] == [32, 32]
     assert load_weights(tmp_path / "generator.safetensors").image_size == generator.image_size == (32, 32)
@@ -195,6 +195,19 @@ def test_truncated_checkpoint_is_refused(tmp_path: Path) -> None:
         train(make_pairs(), TINY, tmp_path, seed=1)
 
 
+@pytest.mark.parametrize("part", ["generator.", "adam.discriminator.", "history"])
+def test_checkpoint_without_a_part_is_refused(tmp_path: Path, part: str) -> None:
+    train(make_pairs(), TINY, tmp_path, seed=1)
+    path = tmp_path / "checkpoint" / "last.safetensors"
+    tensors, about = (
+        {name: value for name, value in content.items() if not name.startswith(part)}
+        for content in load_tensors(path)
+    )
+    save_tensors(path, tensors, about)
+    with pytest.raises(TrainingError, match="last.safetensors: not a whole checkpoint"):
+        train(make_pairs(), TINY, tmp_path, seed=1)
+
+
 def test_loss_that_is_not_finite_names_the_step_and_leaves_the_checkpoint(tmp_path: Path) -> None:
     pairs = make_pairs(12)
     spoilt = int(batch_indices(6, 12, 1, seed=1)[0])
@@ -204,7 +217,7 @@ def test_loss_that_is_not_finite_names_the_step_and_leaves_the_checkpoint(tmp_pa
     )
     with pytest.raises(TrainingError, match=told):
         train(pairs, TINY, tmp_path, seed=1)
-    assert load_metadata(tmp_path / "checkpoint" / "last.safetensors")["step"] == 4
+    assert load_tensors(tmp_path / "checkpoint" / "last.safetensors")[1]["step"] == 4
     assert not (tmp_path / "generator.safetensors").exists()
 
 
@@ -267,3 +280,20 @@ def test_runs_that_cannot_be_are_refused(
 ) -> None:
     with pytest.raises(ValueError, match=fault):
         train(pairs, config, tmp_path, seed=1)
+
+
+def test_checkpoint_of_other_hooks_is_refused(tmp_path: Path) -> None:
+    train(make_pairs(), TINY, tmp_path, seed=1, hooks=TrainHooks(settings={"pos_weight": 9.0}))
+    with pytest.raises(
+        TrainingError, match="last.safetensors: is of another run: pos_weight was 9.0, now None"
+    ):
+        train(make_pairs(), TINY, tmp_path, seed=1)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("num_workers", 0), ("num_workers", 1.5), ("checkpoint_minutes", float("nan")), ("resume", "no")],
+)
+def test_options_out_of_range_are_refused(name: str, value: object) -> None:
+    with pytest.raises(TrainingError, match=f"{name}: "):
+        RunOptions(**{name: value})

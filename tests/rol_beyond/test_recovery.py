@@ -1,10 +1,12 @@
 """Failure detection and relocalization: no false alarm on a good track, a report when lost, and recovery."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from test_search import look, town
 
-from rol.mcl import MclError, localize
+from rol.mcl import MclError, Resampling, localize
 from rol_beyond.motion import MotionModel
 from rol_beyond.recovery import (
     Hypotheses,
@@ -38,10 +40,10 @@ def drive() -> tuple:
 def run(drive: tuple, start: np.ndarray, **changes: object) -> tuple[np.ndarray, list]:
     points, poses, increments, clouds = drive
     reference = measure_reference_contrast(clouds[::5], poses[::5], FIELD.build_grid(points))
-    known = changes.pop("is_start_known", True)
+    known, settings = changes.pop("is_start_known", True), changes.pop("settings", SETTINGS)
     recovery = RecoverySettings(reference, relocalization=RelocalizationSettings(far_reach_m=60.0), **changes)
     rng = np.random.default_rng(1)
-    robust_filter = RecoveringFilter(points, start, SETTINGS, recovery, rng, known)
+    robust_filter = RecoveringFilter(points, start, settings, recovery, rng, known)
     updates = list(localize(robust_filter, increments, clouds))
     return np.hypot(*(np.array([u.filter.pose for u in updates]) - poses)[:, :2].T), updates
 
@@ -60,6 +62,12 @@ def test_a_wrong_start_is_detected_and_corrected(drive: tuple) -> None:
     assert off[:10].min() > 3.0 and off[40:].max() < 1.0
     assert all(u.is_lost for u in updates[8:12]) and not any(u.is_lost for u in updates[40:])
     assert sum(u.was_replaced for u in updates) >= 1
+
+
+def test_a_hypothesis_can_replace_the_estimate_of_the_filter_with_plain_resampling(drive: tuple) -> None:
+    settings = replace(SETTINGS, resampling=Resampling())
+    off, updates = run(drive, drive[1][0] + (12.0, 16.0, np.deg2rad(20.0)), settings=settings)
+    assert sum(u.was_replaced for u in updates) >= 1 and off[40:].max() < 1.0
 
 
 def test_an_unknown_start_is_searched_globally(drive: tuple) -> None:

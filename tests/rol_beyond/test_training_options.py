@@ -10,7 +10,7 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
-from rol.pix2pix import Pix2PixError, TrainConfig, generate, l1_loss, load_metadata, load_weights
+from rol.pix2pix import Pix2PixError, TrainConfig, generate, l1_loss, load_tensors, load_weights
 from rol.training import RunOptions, TrainingError, train
 from rol_beyond.training_options import TrainingExtensions, bce_loss, weighted_l1_loss
 
@@ -93,7 +93,7 @@ def test_drawn_pairs_follow_from_seed_and_step_alone(tmp_path: Path) -> None:
         train(pairs, TINY, tmp_path / "again", seed=1, hooks=extensions.hooks(stop))
     again = train(pairs, TINY, tmp_path / "again", seed=1, hooks=extensions.hooks())[1]
     pd.testing.assert_frame_equal(whole, again, check_exact=True)
-    config = load_metadata(tmp_path / "whole" / "generator.safetensors")["config"]
+    config = load_tensors(tmp_path / "whole" / "generator.safetensors")[1]["config"]
     assert config["rotate"] is True and config["streaks"] == 1.0 and config["ngf"] == 2
 
 

@@ -120,3 +120,10 @@ def test_a_table_is_completed_and_nothing_is_measured_twice(
     assert measured == [("real", "07", 1), ("real", "02", 3)]
     table = pd.read_csv(path, dtype={"session": str})
     assert table.job.tolist() == ["02 3", "07 1"] and table.rmse_m.tolist() == [1.5, 0.5]
+    before = path.read_bytes()
+    with (
+        ThreadPoolExecutor(1) as pool,
+        pytest.raises(ValueError, match="1 jobs are not listed, such as '02 3'"),
+    ):
+        route_tables.run_table(pool, "seeds", [("07", 1)], path, **files)
+    assert path.read_bytes() == before

@@ -12,7 +12,7 @@ import yaml
 pytest.importorskip("open3d")
 pytest.importorskip("torch")
 import train_weights
-from rol.pix2pix import generate, load_metadata, load_weights
+from rol.pix2pix import generate, load_tensors, load_weights
 from rol_study import shipped_networks
 from rol_study.shipped_networks import Places, choose_scans, choose_threshold, load_recipe, make_sessions
 
@@ -66,7 +66,7 @@ def test_one_command_makes_sessions_weights_and_card(
     assert card["history"]["step"] == [2, 4, 6] and card["history"]["loss_gan"] == [None] * 3
     judged = pd.DataFrame(card["judged"])
     assert judged[judged.places == "rest"].threshold.tolist() == list(shipped_networks.THRESHOLDS)
-    header = load_metadata(tmp_path / "tiny.safetensors")
+    header = load_tensors(tmp_path / "tiny.safetensors")[1]
     assert header["card"] == "tiny.json" and header["points"] == {
         "threshold": card["threshold"],
         "thin": True,

@@ -30,7 +30,7 @@ def label_sweep(folder: Path | str, sensor: str, stamp_us: int) -> tuple[np.ndar
     points : array, shape (n, 4), float32
         As `rol.oxford.velodyne_raw_to_points` gives them: x, y, z [m] in the lidar frame, intensity.
     materials : array, shape (n,), uint8
-        `Material` of every point.
+        `rol_sim.world.mesh.Material` of every point.
 
     Raises
     ------

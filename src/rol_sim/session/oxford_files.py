@@ -57,7 +57,7 @@ def _cast(path: Path | str, name: str, values: np.ndarray, dtype: type, shape: t
 
 
 def save_radar(path: Path | str, scan: RadarScan) -> None:
-    """Write one radar scan such that `load_radar` gives it back bit for bit; an OxfordError if not."""
+    """Write one radar scan as `rol.oxford.load_radar` returns it, bit for bit; an OxfordError if not."""
     rows = (N_AZIMUTHS,)
     stamps = _cast(path, "row_stamps_us", scan.row_stamps_us, np.int64, rows)
     counters = _cast(path, "counters", scan.counters, np.uint16, rows)
@@ -69,7 +69,7 @@ def save_radar(path: Path | str, scan: RadarScan) -> None:
 
 
 def save_velodyne_raw(path: Path | str, raw: VelodyneRaw) -> None:
-    """Write one raw sweep such that `load_velodyne_raw` gives it back bit for bit; an OxfordError if not."""
+    """Write one raw sweep as `rol.oxford.load_velodyne_raw` returns it, bit for bit; an OxfordError if not."""
     n = np.size(raw.stamps_us)
     if n == 0:
         raise OxfordError(f"{path}: sweep without a firing")
@@ -84,7 +84,7 @@ def save_velodyne_raw(path: Path | str, raw: VelodyneRaw) -> None:
 
 
 def save_velodyne_binary(path: Path | str, points: np.ndarray) -> None:
-    """Write points (n, 4), as float32, for `load_velodyne_binary`; an OxfordError if it would refuse them."""
+    """Write points (n, 4), float32, for `rol.oxford.load_velodyne_binary`; an OxfordError if it refuses them."""
     points = np.asarray(points, dtype="<f4")
     if points.ndim != 2 or points.shape[1] != 4 or len(points) == 0:
         raise OxfordError(f"{path}: expected points of shape (n, 4) with n > 0, got {points.shape}")
@@ -116,12 +116,12 @@ def _save_table(path: Path | str, table: pd.DataFrame, columns: list[str], stamp
 
 
 def save_gps(path: Path | str, table: pd.DataFrame) -> None:
-    """Write `gps/gps.csv` from a table as `load_gps` gives it, times padded to 19 digits."""
+    """Write `gps/gps.csv` from a table as `rol.oxford.load_gps` returns it, times padded to 19 digits."""
     _save_table(path, table, GPS_COLUMNS, stamp_digits=19)
 
 
 def save_ins(path: Path | str, table: pd.DataFrame) -> None:
-    """Write `gps/ins.csv` from a table as `load_ins` gives it, times padded to 19 digits."""
+    """Write `gps/ins.csv` from a table as `rol.oxford.load_ins` returns it, times padded to 19 digits."""
     _save_table(path, table, INS_COLUMNS, stamp_digits=19)
 
 

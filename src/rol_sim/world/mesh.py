@@ -32,7 +32,6 @@ class Material(IntEnum):
     PERSON = 14  # people on foot
 
 
-MATERIALS = tuple(Material)
 GROUND_MATERIALS = (Material.GROUND, Material.PAVEMENT, Material.GRASS, Material.KERB)
 
 
