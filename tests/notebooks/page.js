@@ -12,6 +12,9 @@ async (known) => {
 
   // ---- wait until the page is at rest -------------------------------------------------------------------------
   await new Promise(requestAnimationFrame);  // the page may still have to follow a change of the window
+  const wanted = matchMedia("(prefers-color-scheme: dark)").matches ? "dark" : "light";
+  const isLate = () => ![undefined, wanted].includes(document.documentElement.dataset.theme);
+  for (let i = 0; i < 40 && isLate(); i++) await pause(50);
   const equations = all(".math");
   if (equations.length && window.MathJax && window.MathJax.startup) await window.MathJax.startup.promise;
   all("img[loading=lazy]").forEach((image) => { image.loading = "eager"; });
@@ -22,6 +25,7 @@ async (known) => {
   const moves = document.getAnimations().map((move) => move.finished.catch(() => null));
   await Promise.race([Promise.all(moves), pause(2000)]);
   await pause(50);
+  for (const move of document.getAnimations()) if (move instanceof CSSTransition) move.finish();
 
   // ---- the page as a whole ------------------------------------------------------------------------------------
   if (!document.querySelector("link[rel~=icon]")) fault("page", "no icon");
@@ -44,7 +48,7 @@ async (known) => {
     texts.add(parent);
     if (parent.closest(untouched)) continue;
     if (/\\[a-zA-Z]{2,}|\\[()[\]]|\$\$|\$[^\s$][^$]*\$/.test(node.data)) fault("equation", `raw TeX: ${node.data}`);
-    if (/`[^`]+`|\*\*\w|\]\(\w/.test(node.data)) fault("markup", `raw Markdown: ${node.data}`);
+    if (/`[^`]+`|\*\*\w|\]\(\w/.test(node.data) && !parent.closest("dl.py")) fault("markup", `raw Markdown: ${node.data}`);
   }
 
   // ---- fonts --------------------------------------------------------------------------------------------------
