@@ -16,8 +16,7 @@ from rol.files import read_text, write_text
 
 def module_name(file: Path) -> str:
     """Give the name by which a file is imported."""
-    parts = file.relative_to(SOURCE).with_suffix("").parts
-    return ".".join(part for part in parts if part != "__init__")
+    return ".".join(file.relative_to(SOURCE).with_suffix("").parts).removesuffix(".__init__")
 
 
 def page_name(file: Path) -> str:
@@ -35,8 +34,7 @@ def table_of(docstrings: dict[str, str | None]) -> list[str]:
     lines = [".. list-table::", "   :header-rows: 1", "", "   * - name", "     - description"]
     for name, docstring in docstrings.items():
         paragraph = " ".join((docstring or "").split("\n\n")[0].split())
-        sentence = re.split(r"(?<=[.?!]) (?=[A-Z])", paragraph)[0]
-        lines += [f"   * - :py:obj:`{name}`", f"     - {sentence}"]
+        lines += [f"   * - :py:obj:`{name}`", f"     - {re.split('(?<=[.?!]) (?=[A-Z])', paragraph)[0]}"]
     return [*lines, ""] if docstrings else []
 
 
