@@ -160,19 +160,19 @@ STEPS = {
         {},
     ),
     "oxford_route": (
-        "09_oxford_route",
+        "11_oxford_route",
         "the real route",
         {"tables": found("data/paper/*.csv"), "measured": found("data/ablations/route_*.csv")},
         {},
     ),
     "real_radar": ("10_real_radar", "real radar", {"weights": NETWORK, "shipped": SHIPPED}, {}),
     "ablations": (
-        "11_ablations",
+        "13_ablations",
         "ablations",
         {"tables": found("data/ablations/*.csv"), "cards": [str(Path(path).with_suffix(".json")) for path in SHIPPED]},
         {},
     ),
-    "performance": ("12_performance", "performance", {"measured": found("data/performance/*.json")}, {}),
+    "runtime": ("14_runtime", "runtime", {"measured": found("data/performance/*.json")}, {}),
 }
 def clear_images(folder, listing, code):
     """Write the command that removes the images of other code from a folder: a job goes on with those of a stopped run."""
@@ -192,7 +192,7 @@ BEFORE = {  # commands that come before papermill
     )
 }
 # All others have 0. Those with -1 need no other chapter and fill gaps.
-PRIORITIES = {"real_vs_fake": 1, "oxford_route": -1, "ablations": -1, "performance": -1}
+PRIORITIES = {"real_vs_fake": 1, "oxford_route": -1, "ablations": -1, "runtime": -1}
 
 
 rule book:

@@ -40,10 +40,10 @@ CHAPTERS = {
     "06_ground_truth": "once",
     "07_localization": "method",
     "08_results": "once",
-    "09_oxford_route": "once",
     "10_real_radar": "once",
-    "11_ablations": "once",
-    "12_performance": "once",
+    "11_oxford_route": "once",
+    "13_ablations": "once",
+    "14_runtime": "once",
 }
 LISTS, FOLDERS = ("sessions", "methods"), ("sessions_root", "out_dir", "book_dir")
 CONFIG_KEYS = {"profile", *LISTS, *FOLDERS, "seed", "notebooks", "simulated"}

@@ -1,7 +1,7 @@
 """Compare the numbers of a build with the reference numbers of its profile, in data/reference.
 
     python workflow/check.py config/demo.yaml                      print the table; exit 1 on a miss
-    python workflow/check.py config/demo.yaml --run metrics.json   compare one rerun of chapter 7 or 9
+    python workflow/check.py config/demo.yaml --run metrics.json   compare one rerun of chapter 7 or 11
     python workflow/check.py --renew config/demo.yaml              take the values of this build as the reference
 
 The names, sources, tolerances and reasons in data/reference are curated by hand; `--renew` replaces values only.

@@ -442,7 +442,7 @@ def test_smoke_profile_plans_every_run(workplace: Path) -> None:
         "localization": "4",
         "total": "34",
         **dict.fromkeys(("book", "sessions", "pix2pix", "real_vs_fake", "ground_truth", "results"), "1"),
-        **dict.fromkeys(("oxford_route", "real_radar", "ablations", "performance"), "1"),
+        **dict.fromkeys(("oxford_route", "real_radar", "ablations", "runtime"), "1"),
     }
 
 
