@@ -311,10 +311,13 @@ def _check_map(path: Path | str, points: np.ndarray, T_map_session: np.ndarray) 
 
 def _unique_cells(points: np.ndarray, cell: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Find the distinct cells of points, the cell of each point, and the number of points of each cell."""
-    indices = np.floor(points / cell).astype(np.int64)
-    low = indices.min(axis=0) if len(indices) else np.zeros(2, dtype=np.int64)
-    width = int(np.ptp(indices[:, 1])) + 1 if len(indices) else 1
-    keys, inverse, counts = np.unique(
-        (indices[:, 0] - low[0]) * width + indices[:, 1] - low[1], return_inverse=True, return_counts=True
-    )
+    keys, columns = (np.floor(points[:, k] / cell).astype(np.int64) for k in range(2))
+    low = np.array([keys.min(), columns.min()] if len(points) else [0, 0])
+    width = int(np.ptp(columns)) + 1 if len(points) else 1
+    # In place, since a map of a long session is large.
+    keys -= low[0]
+    keys *= width
+    keys += columns - low[1]
+    del columns
+    keys, inverse, counts = np.unique(keys, return_inverse=True, return_counts=True)
     return np.stack([keys // width, keys % width], axis=1) + low, inverse, counts

@@ -11,14 +11,14 @@ if __package__:
     from .bev import image_to_points
     from .mcl import MclSettings, ParticleFilter
     from .odometry import icp_2d
+    from .pairs import PairSettings, radar_to_image
     from .pix2pix import TrainedNetwork, generate
-    from .radar import MEASURED, RangeCalibration, polar_to_cartesian
 else:  # this file was copied and is imported by its own name
     from bev import image_to_points
     from mcl import MclSettings, ParticleFilter
     from odometry import icp_2d
+    from pairs import PairSettings, radar_to_image
     from pix2pix import TrainedNetwork, generate
-    from radar import MEASURED, RangeCalibration, polar_to_cartesian
 
 MIN_RANGE_M = 2.5  # closer points come from the radar's own leakage
 
@@ -60,14 +60,10 @@ def scan_to_points(network: TrainedNetwork, scan: Any) -> np.ndarray:
     points : array, shape (n, 2)
         Points in the radar frame [m]. Yin et al. 2020, Sec. III-A, Eq. 5.
     """
-    images = network.settings
-    resolution = images.get("range_resolution", MEASURED.resolution_m)
-    calibration = RangeCalibration(resolution, images.get("range_offset", MEASURED.offset_m))
-    pixels = {name: images[name] for name in ("pixel_size", "width") if name in images}
-    power = polar_to_cartesian(scan.power, scan.azimuths, calibration=calibration, **pixels)
-    generated = generate(network.generator, np.rint(255.0 * power).astype(np.uint8))
-    extent = {name: images[name] for name in ("pixel_size", "max_range") if name in images}
-    return image_to_points(generated, **network.points, **extent, min_range=MIN_RANGE_M)
+    settings = PairSettings.from_dict({**network.settings, "motion": "none"})
+    image = radar_to_image(scan.power, scan.azimuths, None, settings)
+    extent = {"pixel_size": settings.pixel_size, "max_range": settings.max_range}
+    return image_to_points(generate(network.generator, image), **network.points, **extent, min_range=MIN_RANGE_M)
 
 
 class RadarLocalizer:

@@ -24,11 +24,11 @@ from rol.mcl import (
     MapGrid,
     MclSettings,
     MclUpdate,
+    ParticleFilter,
     count_matches,
     log_weights,
     normalize_weights,
     predict,
-    sample_particles,
     update,
 )
 from rol_beyond.likelihood_field import build_likelihood_field
@@ -388,7 +388,7 @@ def measure_reference_contrast(clouds: Iterable[np.ndarray], poses: np.ndarray, 
     return median
 
 
-class RecoveringFilter:
+class RecoveringFilter(ParticleFilter):
     """Particle filter with failure detection and relocalization, given one scan at a time.
 
     Parameters
@@ -420,20 +420,18 @@ class RecoveringFilter:
         is_start_known: bool = True,
         grid: MapGrid | None = None,
     ) -> None:
-        self.map_points, self.settings, self.recovery, self.rng = map_points, settings, recovery, rng
-        self.grid = settings.measurement.build_grid(map_points) if grid is None else grid
+        self.map_points, self.recovery = map_points, recovery
         self.coarse_grid: MapGrid | None = None
         exponent = recovery.stationary_weight * settings.measurement.exponent
         self.stationary = replace(settings, measurement=replace(settings.measurement, exponent=exponent))
-        self.reset(start)
+        grid = settings.measurement.build_grid(map_points) if grid is None else grid
+        super().__init__(grid, start, settings, rng)
         self.is_far = not is_start_known
 
     def reset(self, pose: np.ndarray) -> None:
         """Start again at a pose [m, m, rad]."""
-        n, settings, recovery = self.settings.n_particles, self.settings, self.recovery
-        spreads = settings.start_spread_m, settings.start_spread_yaw_rad
-        self.particles = sample_particles(pose, n, *spreads, self.rng)
-        self.weights = np.full(n, 1.0 / n)
+        super().reset(pose)
+        recovery = self.recovery
         self.hypotheses = no_hypotheses(recovery.confirmation)
         n_clouds = recovery.relocalization.n_clouds
         self.clouds, self.increments = deque(maxlen=n_clouds), deque(maxlen=n_clouds - 1)
