@@ -132,22 +132,16 @@ class ImageFolder:
                 f"{folder}: not empty, and not made for {self.listing} (no settings.json that says so); nothing"
                 " was removed. Choose another folder, or delete this one if its content is not needed"
             )
-        is_other, places = (
-            found != json.loads(json.dumps(wanted)),
-            [folder / name for name in self.subfolders],
-        )
+        is_other = found != json.loads(json.dumps(wanted))
+        places = [folder / name for name in self.subfolders]
         for linked in (place for place in places if is_other and place.is_symlink()):
-            raise ValueError(
-                f"{linked}: a symbolic link; the images of other settings in it were not removed"
-            )
+            raise ValueError(f"{linked}: a symbolic link; images of other settings in it were not removed")
         (folder / self.listing).unlink(missing_ok=True)
         for leftover in (path for place in places for path in place.glob(".*.png.*.tmp")):
             leftover.unlink()  # of a run that was killed
         images = [{path for path in place.glob("*.png") if path.stem.isdecimal()} for place in places]
         if not is_other:
-            return {
-                int(stem) for stem in set.intersection(*({path.stem for path in there} for there in images))
-            }
+            return {int(stem) for stem in set.intersection(*({path.stem for path in one} for one in images))}
         for path in set.union(*images):
             path.unlink()
         write_text(marker, json.dumps(wanted, indent=1, sort_keys=True))

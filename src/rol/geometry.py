@@ -8,8 +8,8 @@ pose of ``b`` as seen from ``a``. A 3D transform is a 4 x 4 matrix with the same
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import fields
-from typing import Any
+from dataclasses import is_dataclass
+from typing import Any, get_args, get_origin, get_type_hints
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -34,7 +34,7 @@ def wrap_angle(angle: np.ndarray | float) -> np.ndarray | float:
     return (angle + np.pi) % (2.0 * np.pi) - np.pi
 
 
-def check_poses(poses: np.ndarray, name: str = "poses") -> np.ndarray:
+def check_poses(poses: np.ndarray, name: str = "poses", error: type[ValueError] = ValueError) -> np.ndarray:
     """Check that an array holds finite 2D poses.
 
     Parameters
@@ -43,6 +43,8 @@ def check_poses(poses: np.ndarray, name: str = "poses") -> np.ndarray:
         Poses (x, y, yaw) [m, m, rad].
     name : str
         What the array is called in the message.
+    error : type
+        Exception to raise.
 
     Returns
     -------
@@ -52,15 +54,23 @@ def check_poses(poses: np.ndarray, name: str = "poses") -> np.ndarray:
     Raises
     ------
     ValueError
-        If the last axis is not 3 or a value is not finite.
+        Or the given ``error``, if a value is no number or not finite, or the last axis is not 3.
     """
-    poses = np.asarray(poses, dtype=np.float64)
+    poses = _to_floats(poses, name, error)
     if poses.ndim == 0 or poses.shape[-1] != 3:
-        raise ValueError(f"{name}: expected shape (..., 3) for (x, y, yaw), got {poses.shape}")
+        raise error(f"{name}: expected shape (..., 3) for (x, y, yaw), got {poses.shape}")
     if not np.isfinite(poses).all():
         first = np.argwhere(~np.isfinite(poses))[0]
-        raise ValueError(f"{name}: value at index {tuple(int(i) for i in first)} is not finite")
+        raise error(f"{name}: value at index {tuple(int(i) for i in first)} is not finite")
     return poses
+
+
+def check_pose(pose: np.ndarray, name: str = "pose", error: type[ValueError] = ValueError) -> np.ndarray:
+    """Check that an array is one finite 2D pose, shape (3,), as `check_poses` does with many."""
+    pose = check_poses(pose, name, error)
+    if pose.ndim != 1:
+        raise error(f"{name}: expected shape (3,) for (x, y, yaw), got {pose.shape}")
+    return pose
 
 
 def check_points(
@@ -94,9 +104,9 @@ def check_points(
     Raises
     ------
     ValueError
-        Or the given ``error``, if the shape is another one or a coordinate is not finite.
+        Or the given ``error``, if the shape is another one or a coordinate is no number or not finite.
     """
-    points = np.ascontiguousarray(points, dtype=np.float64)
+    points = np.ascontiguousarray(_to_floats(points, name, error))
     if points.size == 0:
         return points.reshape(0, columns)
     if points.ndim != 2 or points.shape[1] < columns or (points.shape[1] > columns and not more):
@@ -108,6 +118,14 @@ def check_points(
     return points
 
 
+def _to_floats(values: Any, name: str, error: type[ValueError]) -> np.ndarray:
+    """Convert to an array of float64; refuse text, other objects, and rows of different lengths."""
+    try:
+        return np.asarray(values, dtype=np.float64)
+    except (TypeError, ValueError) as fault:
+        raise error(f"{name}: not an array of numbers ({fault})") from fault
+
+
 def check_fields(
     settings: Any, allowed: Mapping[str | tuple[str, ...], str], error: type[ValueError] = ValueError
 ) -> None:
@@ -117,7 +135,8 @@ def check_fields(
     ----------
     settings : dataclass
         Instance to check; fields declared as ``int`` must be whole numbers, those declared as ``bool`` True or False;
-        tuples are checked value by value.
+        tuples are checked value by value. Fields declared as ``str``, as a mapping or as a settings class must be of that
+        class, or of another one that has all its public methods.
     allowed : mapping
         Range or choices -> names of the fields, separated by spaces. A range is written as an interval, such as
         "(0, inf)", where a bracket includes the bound; choices are a tuple of words.
@@ -129,10 +148,9 @@ def check_fields(
     ValueError
         Or the given ``error``, with the field's name, its value and what is allowed; NaN is in no range.
     """
-    kinds = {field.name: str(field.type) for field in fields(settings)}
-    for name in (name for name, kind in kinds.items() if kind == "bool"):
-        if type(getattr(settings, name)) is not bool:
-            raise error(f"{name}: {getattr(settings, name)!r} is neither True nor False")
+    kinds = get_type_hints(type(settings))
+    for name, kind in kinds.items():
+        _check_kind(name, getattr(settings, name), kind, error)
     for span, names in allowed.items():
         for name in names.split():
             value = getattr(settings, name)
@@ -140,27 +158,45 @@ def check_fields(
                 if value not in span:
                     raise error(f"{name}: {value!r} is none of {', '.join(span)}")
             else:
-                check_number(name, value, span, kinds[name] == "int", error)
+                check_number(name, value, span, kinds[name], error)
 
 
-def check_number(
-    name: str, value: Any, span: str, is_whole: bool = False, error: type[ValueError] = ValueError
-) -> None:
+def _check_kind(name: str, value: Any, kind: Any, error: type[ValueError]) -> None:
+    """Check a flag, a text, a nested settings class, or a mapping to them."""
+    base = get_origin(kind) or kind
+    if base is bool and type(value) is not bool:
+        raise error(f"{name}: {value!r} is neither True nor False")
+    if (base in (str, dict, Mapping) or is_dataclass(base)) and not _acts_as(value, base):
+        raise error(f"{name}: expected {base.__name__}, got {value!r:.60}")
+    for key, part in value.items() if base in (dict, Mapping) else ():
+        _check_kind(f"{name}: {key}", part, get_args(kind)[1], error)
+
+
+def _acts_as(value: Any, kind: type) -> bool:
+    """Check whether a value is of a class, or has all its public methods, such as another motion model."""
+    methods = [name for name, part in vars(kind).items() if callable(part) and name[0] != "_"]
+    has_all = methods and all(callable(getattr(value, name, None)) for name in methods)
+    return isinstance(value, kind) or (has_all and not isinstance(value, type))
+
+
+def check_number(name: str, value: Any, span: str, kind: Any, error: type[ValueError] = ValueError) -> None:
     """Check that a number, or each number of nested tuples, lies in an interval such as "[0, 1)".
+
+    The kind ``int`` asks for one whole number and ``float`` for one number; with any other kind, numbers may be nested.
 
     Raises
     ------
     ValueError
         Or the given ``error``, with the name, the value and the interval; NaN is in no interval.
     """
-    if not _is_in(value, span, is_whole):
-        raise error(f"{name}: {value} is not {'a whole number in ' if is_whole else 'in '}{span}")
+    if not _is_in(value, span, kind):
+        raise error(f"{name}: {value!r:.60} is not {'a whole number in ' if kind is int else 'in '}{span}")
 
 
-def _is_in(value: Any, span: str, is_whole: bool) -> bool:
+def _is_in(value: Any, span: str, kind: Any) -> bool:
     """Check whether a number, or each number of nested tuples, lies in an interval such as "[0, 1)"."""
     values = np.asarray(value)
-    if values.dtype.kind not in ("iu" if is_whole else "iuf"):
+    if values.dtype.kind not in ("iu" if kind is int else "iuf") or (kind in (int, float) and values.ndim):
         return False
     low, high = (float(bound) for bound in span[1:-1].split(","))
     above = values >= low if span[0] == "[" else values > low
@@ -333,7 +369,7 @@ def accumulate_increments(
         Pose of every frame, the start first; yaw in [-pi, pi).
     """
     increments = check_poses(np.asarray(increments, dtype=np.float64).reshape(-1, 3), "increments")
-    x0, y0, yaw0 = check_poses(start, "start")
+    x0, y0, yaw0 = check_pose(start, "start")
     yaws = yaw0 + np.concatenate([[0.0], np.cumsum(increments[:, 2])])
     c, s = np.cos(yaws[:-1]), np.sin(yaws[:-1])
     dx, dy = increments[:, 0], increments[:, 1]
@@ -357,7 +393,7 @@ def transform_points(T_a_b: np.ndarray, points: np.ndarray) -> np.ndarray:
     points : array, shape (n, 2)
         The same points in frame a [m].
     """
-    x, y, yaw = T_a_b
+    x, y, yaw = check_pose(T_a_b, "T_a_b")
     c, s = np.cos(yaw), np.sin(yaw)
     return np.asarray(points, dtype=np.float64) @ np.array([[c, s], [-s, c]]) + (x, y)
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import io
 import zipfile
+import zlib
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,11 +19,11 @@ from scipy.spatial import cKDTree
 
 if __package__:
     from .files import write_bytes
-    from .geometry import check_grid, check_points, check_poses, compose, transform_points
+    from .geometry import check_grid, check_points, check_pose, check_poses, compose, transform_points
     from .odometry import IcpSettings, icp_2d
 else:  # this file was copied and is imported by its own name
     from files import write_bytes
-    from geometry import check_grid, check_points, check_poses, compose, transform_points
+    from geometry import check_grid, check_points, check_pose, check_poses, compose, transform_points
     from odometry import IcpSettings, icp_2d
 
 
@@ -187,7 +188,7 @@ def register_maps(
     for points, name in ((source, "source"), (target, "target")):
         if len(points) == 0:
             raise MapError(f"the {name} map is empty")
-    pose, done, converged = check_poses(init, "initial guess"), [], False
+    pose, done, converged = check_pose(init, "initial guess"), [], False
     for reach, max_distance, min_distance, cell in stages:
         near = thin_points(source[np.hypot(source[:, 0], source[:, 1]) < reach], cell)[0]
         limits = {"max_distance": max_distance, "min_distance": min_distance, "tolerance": 1e-4}
@@ -216,7 +217,7 @@ def to_first_map(T_map_session: np.ndarray, poses: np.ndarray) -> np.ndarray:
     poses : array, shape (n, 3)
         Poses T_map_radar. Yin et al. 2020, Sec. IV-A.
     """
-    return compose(T_map_session, check_poses(poses))
+    return compose(check_pose(T_map_session, "T_map_session"), check_poses(poses))
 
 
 def residuals_along(clouds: Iterable[np.ndarray], poses: np.ndarray, map_points: np.ndarray) -> np.ndarray:
@@ -293,7 +294,7 @@ def load_map(path: Path | str) -> tuple[np.ndarray, np.ndarray]:
     try:
         with open(path, "rb") as file, np.load(file) as content:
             points, T_map_session = content["points"], content["T_map_session"]
-    except (KeyError, ValueError, EOFError, OSError, zipfile.BadZipFile) as error:
+    except (KeyError, TypeError, ValueError, EOFError, OSError, zipfile.BadZipFile, zlib.error) as error:
         raise MapError(f"{path}: not a whole map file ({error})") from error
     _check_map(path, points, T_map_session)
     return points, T_map_session
@@ -304,8 +305,7 @@ def _check_map(path: Path | str, points: np.ndarray, T_map_session: np.ndarray) 
     check_points(points, str(path), error=MapError)
     if len(points) == 0:
         raise MapError(f"{path}: the map is empty")
-    if np.shape(T_map_session) != (3,) or not np.isfinite(T_map_session).all():
-        raise MapError(f"{path}: expected a finite pose (3,), got {T_map_session}")
+    check_pose(T_map_session, f"{path}: T_map_session", MapError)
     check_grid((1, 1), points, str(path), error=MapError)
 
 

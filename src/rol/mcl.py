@@ -15,10 +15,10 @@ import numpy as np
 
 if __package__:
     from .compiled import compiled
-    from .geometry import check_fields, check_grid, check_points, check_poses, compose, wrap_angle
+    from .geometry import check_fields, check_grid, check_points, check_pose, check_poses, compose, wrap_angle
 else:  # this file was copied and is imported by its own name
     from compiled import compiled
-    from geometry import check_fields, check_grid, check_points, check_poses, compose, wrap_angle
+    from geometry import check_fields, check_grid, check_points, check_pose, check_poses, compose, wrap_angle
 
 
 class MclError(ValueError):
@@ -344,7 +344,7 @@ def sample_particles(
     if n < 1:
         raise MclError(f"at least one particle is needed, got {n}")
     spreads = spread_m, spread_m, spread_yaw
-    particles = check_poses(pose, "start pose") + rng.standard_normal((n, 3)) * spreads
+    particles = check_pose(pose, "start pose") + rng.standard_normal((n, 3)) * spreads
     particles[:, 2] = wrap_angle(particles[:, 2])
     return particles
 
@@ -370,7 +370,7 @@ def predict(
     particles : array, shape (n, 3)
         Poses at this scan. Yin et al. 2020, Sec. III-B, Eq. 7.
     """
-    increment = check_poses(increment, "odometry increment")
+    increment = check_pose(increment, "odometry increment")
     return compose(particles, motion.sample(increment, len(particles), rng))
 
 

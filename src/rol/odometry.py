@@ -15,10 +15,10 @@ import numpy as np
 
 if __package__:
     from .compiled import compiled
-    from .geometry import check_fields, check_points, check_poses
+    from .geometry import check_fields, check_points, check_pose
 else:  # this file was copied and is imported by its own name
     from compiled import compiled
-    from geometry import check_fields, check_points, check_poses
+    from geometry import check_fields, check_points, check_pose
 
 
 class OdometryError(ValueError):
@@ -190,7 +190,7 @@ def icp_2d(
         If a cloud has another shape or a value that is not finite. Yin et al. 2020, Sec. III-B, below Eq. 7.
     """
     source = check_points(source, "source cloud", error=OdometryError)
-    pose = check_poses(init, "initial guess").copy()
+    pose = check_pose(init, "initial guess").copy()
     target = target if isinstance(target, SortedCloud) else sort_cloud(target)
     if min(len(source), _count_around(target, settings.min_matched)) < settings.min_matched:
         return IcpResult(pose, 0, float("nan"), 0, False)
@@ -227,7 +227,7 @@ def scan_to_scan_icp(
         Sec. III-B.
     """
     clouds = iter(clouds)
-    guess = np.zeros(3) if first_guess is None else check_poses(first_guess, "first guess")
+    guess = np.zeros(3) if first_guess is None else check_pose(first_guess, "first guess")
     target = next(clouds, None)
     for source in clouds:
         start = refine_guess(source, target, guess) if refine_guess else guess

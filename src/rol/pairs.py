@@ -693,10 +693,8 @@ class PairDataset:
 
     def __getitem__(self, index: int) -> tuple[np.ndarray, np.ndarray]:
         """Return radar and lidar image, float32 (1, h, w), -1 for grey value 0 and +1 for 255."""
-        radar, lidar = (
-            normalize_image(image[None]) for image in load_pair(self.folder, self.stamps_us[index])
-        )
-        return radar, lidar
+        radar, lidar = load_pair(self.folder, self.stamps_us[index])
+        return normalize_image(radar[None]), normalize_image(lidar[None])
 
 
 def _write_one(task: tuple[Session, str | Path, AlignedScan, PairSettings | None]) -> int:

@@ -14,7 +14,6 @@ weights and the order of the pairs are random.
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -30,11 +29,11 @@ from torch.nn import functional
 if __package__:
     from .bev import normalize_image
     from .files import write_bytes
-    from .geometry import check_fields
+    from .geometry import check_fields, check_number
 else:  # this file was copied and is imported by its own name
     from bev import normalize_image
     from files import write_bytes
-    from geometry import check_fields
+    from geometry import check_fields, check_number
 
 
 class Pix2PixError(ValueError):
@@ -222,10 +221,8 @@ def build_generator(
         If the architecture is not registered, or cannot have this width and depth.
     """
     network = _find_architecture(architecture)
-    if ngf < 1 or n_blocks < 0:
-        raise Pix2PixError(
-            f"generator: ngf must be at least 1 and n_blocks at least 0, got {ngf}, {n_blocks}"
-        )
+    check_number("ngf", ngf, "[1, inf)", int, Pix2PixError)
+    check_number("n_blocks", n_blocks, "[0, inf)", int, Pix2PixError)
     with torch.device("meta"):  # no weights drawn from torch's global state
         built = network(ngf, n_blocks)
     return _initialise(built, rng)
@@ -500,8 +497,7 @@ def generate(
         raise Pix2PixError(f"radar image: expected uint8 (h, w), got {radar_image.dtype} {radar_image.shape}")
     check_size(radar_image.shape, generator.image_size, "radar image", generator.size_step)
     n_turns = generator.tta_rotations if tta_rotations is None else tta_rotations
-    if n_turns not in (1, 2, 3, 4):
-        raise Pix2PixError(f"tta_rotations: expected 1 to 4, got {n_turns}")
+    check_number("tta_rotations", n_turns, "[1, 4]", int, Pix2PixError)
     radar = to_tensor(radar_image).to(next(generator.parameters()).device)
     with torch.inference_mode(), torch.autocast(radar.device.type, torch.bfloat16, enabled=bf16):
         logits = sum(
@@ -612,24 +608,40 @@ def load_network(path: str | Path) -> TrainedNetwork:
     Raises
     ------
     Pix2PixError
-        As `load_weights`, or if ``points`` or ``pairs_settings`` of the header hold anything else.
+        As `load_weights`, or if ``points`` or ``pairs_settings`` of the header hold values of another type or out of
+        range.
     """
     tensors, about = load_tensors(Path(path))
-    points, settings = _read_points(path, about), dict(about.get("pairs_settings", {}))
-    return TrainedNetwork(_restore_generator(path, tensors, about), points, settings, about)
+    return TrainedNetwork(_restore_generator(path, tensors, about), *_read_settings(path, about), about)
 
 
-def _read_points(path: str | Path, about: dict[str, Any]) -> dict[str, Any]:
-    """Read how points are made from the header; refuse other types than those of the defaults."""
+# Settings of pairs in the header, in the ranges of `rol.pairs.PairSettings`, which needs more modules than a network.
+_RANGES = {"width": "[1, inf)", "max_range": "(0, inf]", "min_height": "[-inf, inf)"}
+_RANGES |= dict.fromkeys(("range_resolution", "pixel_size"), "(0, inf)")
+_RANGES |= dict.fromkeys(("range_offset", "doppler_seconds"), "(-inf, inf)")
+
+
+def _read_settings(path: str | Path, about: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Read from the header how points and radar images are made; refuse other types and values out of range.
+
+    Other keys of ``pairs_settings`` are kept: `rol.pairs.pair_folder` adds its own.
+    """
     defaults = {"threshold": 128, "thin": False}
     for name in ("points", "pairs_settings"):
         if not isinstance(about.get(name, {}), dict):
             raise Pix2PixError(f"{path}: header: {name} is {about[name]!r:.60}, not a JSON object")
-    points = {**defaults, **about.get("points", {})}
+    points, pairs = {**defaults, **about.get("points", {})}, dict(about.get("pairs_settings", {}))
     for name, value in points.items():
         if type(value) is not type(defaults.get(name)):
             raise Pix2PixError(f"{path}: header: points: {name} is {value!r:.60}, known are {defaults}")
-    return points
+    check_number(f"{path}: header: points: threshold", points["threshold"], "[0, 255]", int, Pix2PixError)
+    where = f"{path}: header: pairs_settings"
+    if (motion := pairs.get("motion", "none")) not in ("none", "corrected"):
+        raise Pix2PixError(f"{where}: motion is {motion!r:.60}, expected 'none' or 'corrected'")
+    for name in (name for name in _RANGES if name in pairs):
+        kind = int if name == "width" else float
+        check_number(f"{where}: {name}", pairs[name], _RANGES[name], kind, Pix2PixError)
+    return points, pairs
 
 
 def _restore_generator(path: str | Path, tensors: dict[str, Tensor], about: dict[str, Any]) -> Generator:
@@ -639,10 +651,9 @@ def _restore_generator(path: str | Path, tensors: dict[str, Tensor], about: dict
     except Pix2PixError as error:
         raise Pix2PixError(f"{path}: {error}") from error
     _check_header(path, about)
-    try:  # also raised when the width or depth needs more memory than there is
-        generator = build_generator(
-            about["filters"], about["blocks"], network.architecture, rng=torch.Generator()
-        )
+    try:  # RuntimeError also when the width or depth needs more memory than there is
+        size = about["filters"], about["blocks"]
+        generator = build_generator(*size, network.architecture, rng=torch.Generator())
         generator.load_state_dict(tensors)
     except RuntimeError as error:
         raise Pix2PixError(f"{path}: tensors do not fit the header's architecture ({error})") from error
@@ -694,9 +705,7 @@ def load_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
     except (SafetensorError, OSError) as error:
         raise Pix2PixError(f"{path}: not a whole safetensors file ({error})") from error
     if about is None:
-        raise Pix2PixError(
-            f"{path}: header does not describe a network; the file was not written by rol.pix2pix"
-        )
+        raise Pix2PixError(f"{path}: header describes no network; the file was not written by rol.pix2pix")
     try:
         header = json.loads(about)
     except ValueError as error:
@@ -721,13 +730,7 @@ def _check_header(path: str | Path, about: dict[str, Any]) -> None:
     size = about.get("image_size")
     if size is not None and not (isinstance(size, list) and len(size) == 2):
         raise Pix2PixError(f"{path}: header: image_size is {size!r}, expected two numbers or null")
-    numbers = {name: about.get(name) for name in ("filters", "blocks")} | {
-        "headings": about.get("headings", 1)
-    }
-    for name, number in [*numbers.items(), *(("image_size", n) for n in size or ())]:
-        low, high = {"blocks": (0, math.inf), "headings": (1, 4)}.get(name, (1, math.inf))
-        if type(number) is not int or not low <= number <= high:
-            raise Pix2PixError(
-                f"{path}: header: {name} is {number!r}, expected a whole number from {low}"
-                + (f" to {high}" if high < math.inf else "")
-            )
+    numbers = [(name, {"headings": 1, **about}.get(name)) for name in ("filters", "blocks", "headings")]
+    for name, number in [*numbers, *(("image_size", n) for n in size or ())]:
+        span = {"blocks": "[0, inf)", "headings": "[1, 4]"}.get(name, "[1, inf)")
+        check_number(f"{path}: header: {name}", number, span, int, Pix2PixError)

@@ -14,9 +14,9 @@ import cv2
 import numpy as np
 
 if __package__:
-    from .geometry import check_fields, check_poses, exp
+    from .geometry import check_fields, check_pose, exp
 else:  # this file was copied and is imported by its own name
-    from geometry import check_fields, check_poses, exp
+    from geometry import check_fields, check_pose, exp
 
 DOPPLER_SECONDS = 0.049  # a target ahead reads nearer by this time multiplied by the closing speed
 SCAN_SECONDS = 0.25  # one turn
@@ -75,7 +75,7 @@ class ScanMotion:
 
     def __post_init__(self) -> None:
         check_fields(self, {"(0, inf)": "scan_seconds", "(-inf, inf)": "doppler_seconds"})
-        check_poses(self.twist, "twist")
+        check_pose(self.twist, "twist")
 
 
 def polar_to_cartesian(
@@ -167,7 +167,7 @@ def deskew_points(
         The points in the frame at the reference time [m].
     """
     points = np.asarray(points, dtype=np.float64)
-    poses = exp(twist, seconds)
+    poses = exp(check_pose(twist, "twist"), seconds)
     c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
     moved = points.copy()
     moved[:, 0] = c * points[:, 0] - s * points[:, 1] + poses[:, 0]
@@ -324,9 +324,8 @@ def peaks_to_points(
     points = np.stack([ranges * np.cos(bearings), ranges * np.sin(bearings)], axis=1)[is_near]
     if motion is None:
         return points
-    return deskew_points(
-        points, azimuth_times(len(azimuths), motion.scan_seconds)[rows[is_near]], motion.twist
-    )
+    seconds = azimuth_times(len(azimuths), motion.scan_seconds)[rows[is_near]]
+    return deskew_points(points, seconds, motion.twist)
 
 
 def k_strongest_peaks(
@@ -444,12 +443,7 @@ def _row_table(azimuths: np.ndarray, step: float) -> np.ndarray | None:
 
 
 def _beam_at_places(
-    x: np.ndarray,
-    y: np.ndarray,
-    rows: np.ndarray,
-    n_rows: int,
-    step: float,
-    motion: ScanMotion,
+    x: np.ndarray, y: np.ndarray, rows: np.ndarray, n_rows: int, step: float, motion: ScanMotion
 ) -> tuple[np.ndarray, np.ndarray]:
     """Compute range and row at which the moving radar saw places given in the frame at mid-scan.
 

@@ -6,6 +6,7 @@ therefore as good as the recorded one: no pixel is interpolated twice, no corner
 
 from __future__ import annotations
 
+import zlib
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
@@ -13,6 +14,7 @@ from io import BytesIO
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
+from zipfile import BadZipFile
 
 import numpy as np
 
@@ -267,12 +269,17 @@ def gather_clouds(
     -------
     clouds : LidarClouds
         In the order of the scans.
+
+    Raises
+    ------
+    ValueError
+        If there is a file that `gather_clouds` did not write or that is not whole; the message names it.
     """
     path, about = Path(path), repr((settings, list(aligned)))
     if path.is_file():
-        with np.load(path) as file:
-            if str(file["about"]) == about:
-                return LidarClouds(file["points"], file["starts"])
+        kept, points, starts = _read_clouds(path)
+        if kept == about:
+            return LidarClouds(points, starts)
     tasks, parts = [(session, one, settings) for one in aligned], []
     with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
         for part in pool.map(_gather_one, tasks, chunksize=8):
@@ -284,6 +291,15 @@ def gather_clouds(
     np.savez_compressed(content, points=clouds.points, starts=clouds.starts, about=about)
     write_bytes(path, content.getvalue())
     return clouds
+
+
+def _read_clouds(path: Path) -> tuple[str, np.ndarray, np.ndarray]:
+    """Read a file of `gather_clouds`: its scans and settings, points, and starts; refuse any other file."""
+    try:
+        with open(path, "rb") as file, np.load(file) as content:
+            return str(content["about"]), content["points"], content["starts"]
+    except (KeyError, TypeError, ValueError, EOFError, OSError, BadZipFile, zlib.error) as error:
+        raise ValueError(f"{path}: not a whole file of lidar points ({error}); delete it") from error
 
 
 def _gather_one(task: tuple[Session, AlignedScan, PairSettings]) -> np.ndarray:

@@ -16,7 +16,7 @@ from rol.compiled import compiled
 from rol.geometry import (
     check_fields,
     check_points,
-    check_poses,
+    check_pose,
     compose,
     exp,
     log,
@@ -178,11 +178,19 @@ class LocalMapSettings:
         Registration to it.
     plausibility : PlausibilitySettings
         Rejection of motions.
+
+    Raises
+    ------
+    ValueError
+        If a part is of another class; the message names it.
     """
 
     map: MapSettings = field(default_factory=MapSettings)
     icp: RobustIcpSettings = field(default_factory=RobustIcpSettings)
     plausibility: PlausibilitySettings = field(default_factory=PlausibilitySettings)
+
+    def __post_init__(self) -> None:
+        check_fields(self, {})
 
 
 @dataclass(frozen=True)
@@ -311,7 +319,7 @@ def register_robust(
     1 / (1 + e / scale^2)^2 in each step. A point on a line constrains the motion along the line only weakly.
     """
     source = check_points(source, "source cloud", error=OdometryError)
-    pose = check_poses(init, "initial guess").copy()
+    pose = check_pose(init, "initial guess").copy()
     scale = settings.start_scale_m
     source, n_matched, rmse_m = choose_evenly(source, settings.max_points), 0, float("nan")
     for iteration in range(1, settings.max_iterations + 1):
@@ -404,7 +412,7 @@ class LocalMapOdometry:
         self.fine = replace(settings.icp, start_scale_m=settings.icp.end_scale_m)
         self.deskew = deskew or (lambda cloud, twist: cloud)
         self.is_twist_known = first_twist is not None
-        self.twist = check_poses(first_twist, "first twist") if self.is_twist_known else np.zeros(3)
+        self.twist = check_pose(first_twist, "first twist") if self.is_twist_known else np.zeros(3)
         self.pose, self.n_scans, self.stamp_us = np.zeros(3), 0, 0
 
     def step(self, cloud: np.ndarray, stamp_us: int) -> LocalMapIncrement | None:

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rol.geometry import check_fields, check_poses, wrap_angle
+from rol.geometry import check_fields, check_pose, check_poses, wrap_angle
 
 MIN_SIGMAS = (0.02, 0.01, np.deg2rad(0.1))  # of a stationary vehicle, which may creep [m, m, rad]
 
@@ -222,7 +222,7 @@ def gate_odometry(
     """
     last, n_rejected = None, 0
     for increment in increments:
-        increment = check_poses(increment, "odometry increment")
+        increment = check_pose(increment, "odometry increment")
         if last is not None and n_rejected < patience:
             change = abs(increment[0] - last[0]), abs(float(wrap_angle(increment[2] - last[2])))
             if change[0] > max_change[0] or change[1] > max_change[1]:

@@ -19,7 +19,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from rol.geometry import check_fields, check_poses, first_of_cells, wrap_angle
+from rol.geometry import check_fields, check_pose, check_poses, first_of_cells, wrap_angle
 from rol.mcl import (
     MapGrid,
     MclSettings,
@@ -379,7 +379,8 @@ def measure_reference_contrast(clouds: Iterable[np.ndarray], poses: np.ndarray, 
     ValueError
         If the scans match no better than by chance: wrong poses, or the wrong map.
     """
-    found = [score_contrast(pose[None], cloud, grid)[0] for cloud, pose in zip(clouds, poses, strict=True)]
+    pairs = zip(clouds, check_poses(poses), strict=True)
+    found = [score_contrast(check_pose(pose, "poses")[None], cloud, grid)[0] for cloud, pose in pairs]
     median = float(np.median(found)) if found else 0.0
     if median <= 0.0:
         raise ValueError(

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from rol.geometry import check_fields, check_number, check_points, check_poses, compose
+from rol.geometry import check_fields, check_number, check_points, check_pose, compose
 from rol.odometry import IcpResult, IcpSettings, OdometryError, choose_evenly, icp_2d, sort_cloud
 
 _MAX_CELLS = 10**8  # of the grid of a search: 400 MB
@@ -57,12 +57,12 @@ def correlative_scan_match(
         If a cloud has another shape or a value that is not finite, a setting is out of its range, or the clouds extend so
         far that the grid would need more than 400 MB.
     """
-    check_number("window", window, "[0, 100]", error=OdometryError)
-    check_number("cell", cell, "(0, inf)", error=OdometryError)
-    check_number("max_points", max_points, "[1, inf)", True, OdometryError)
+    check_number("window", window, "[0, 100]", tuple, OdometryError)
+    check_number("cell", cell, "(0, inf)", float, OdometryError)
+    check_number("max_points", max_points, "[1, inf)", int, OdometryError)
     source = check_points(source, "source cloud", error=OdometryError)
     target = check_points(target, "target cloud", error=OdometryError)
-    best = check_poses(guess, "initial guess").copy()
+    best = check_pose(guess, "initial guess").copy()
     if min(len(source), len(target)) == 0:
         return best
     source = choose_evenly(source, max_points)
@@ -148,7 +148,7 @@ def scan_to_map_icp(
     OdometryError
         If there are too few increments, or a cloud has another shape or a value that is not finite.
     """
-    target, pose, increments = sort_cloud(map_points, "map"), check_poses(start, "start"), iter(increments)
+    target, pose, increments = sort_cloud(map_points, "map"), check_pose(start, "start"), iter(increments)
     for index, cloud in enumerate(clouds):
         increment = np.zeros(3) if index == 0 else next(increments, None)
         if increment is None:
@@ -161,7 +161,7 @@ def scan_to_map_icp(
             result = replace(result, T_target_source=guess, converged=False)
         yield result
         restart = reset_callback(index, result.T_target_source) if reset_callback else None
-        pose = result.T_target_source if restart is None else check_poses(restart, "restart")
+        pose = result.T_target_source if restart is None else check_pose(restart, "restart")
 
 
 def _crop_target(

@@ -20,7 +20,7 @@ from scipy.spatial import cKDTree
 from rol.geometry import (
     check_fields,
     check_grid,
-    check_poses,
+    check_pose,
     compose,
     invert,
     transform_points,
@@ -249,7 +249,7 @@ def search_poses(
     contrast : array, shape (k,)
         See `score_contrast`.
     """
-    centre = check_poses(centre, "centre of the search")
+    centre = check_pose(centre, "centre of the search")
     if len(points) == 0:
         return np.zeros((0, 3)), np.zeros(0)
     candidates = _search_coarsely(points, coarse, centre, settings)

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from rol.geometry import check_fields
-from rol.pix2pix import Generator, TrainConfig, build_discriminator, build_generator
+from rol.pix2pix import ARCHITECTURES, Generator, TrainConfig, build_discriminator, build_generator
 from rol.training import TrainHooks, TrainingError
 from rol_beyond import unet  # noqa: F401 (registers its architecture)
 
@@ -82,6 +82,7 @@ class TrainingExtensions:
 
     def __post_init__(self) -> None:
         allowed = {
+            tuple(ARCHITECTURES): "architecture",
             ("l1", "bce"): "pixel_loss",
             "(0, inf)": "pos_weight",
             "[0, inf)": "gain_spread_db streaks ghosts",

@@ -7,8 +7,13 @@ import pytest
 from numpy.testing import assert_allclose
 
 from rol import geometry
+from rol.maps import register_maps, to_first_map
+from rol.mcl import MapGrid, MclSettings, MotionNoise, ParticleFilter, predict, sample_particles
+from rol.odometry import icp_2d, scan_to_scan_icp
+from rol.radar import ScanMotion, deskew_points
 
 QUARTER = np.pi / 2
+GRID = MapGrid(np.zeros((2, 2), np.uint8), np.zeros(2), 0.5)
 
 
 @pytest.mark.parametrize(
@@ -126,6 +131,31 @@ def test_check_poses_names_what_is_wrong():
     with pytest.raises(ValueError, match=r"poses: value at index \(1, 2\) is not finite"):
         geometry.check_poses([[0, 0, 0], [0, 0, np.nan]])
     assert geometry.check_poses([1, 2, 3]).dtype == np.float64
+    for bad in (["a", 0, 0], [[0, 0, 0], [0, 0]], [None, {}, 0]):
+        with pytest.raises(ValueError, match="start: not an array of numbers"):
+            geometry.check_pose(bad, "start")
+
+
+@pytest.mark.parametrize("bad", [np.zeros((2, 3)), np.zeros((1, 3)), np.zeros(2), 0.0])
+@pytest.mark.parametrize(
+    ("call", "name"),
+    [
+        (lambda pose: geometry.accumulate_increments(np.zeros((4, 3)), pose), "start"),
+        (lambda pose: geometry.transform_points(pose, np.zeros((4, 2))), "T_a_b"),
+        (lambda pose: icp_2d(np.zeros((4, 2)), np.zeros((4, 2)), pose), "initial guess"),
+        (lambda pose: list(scan_to_scan_icp([np.zeros((4, 2))] * 2, pose)), "first guess"),
+        (lambda pose: register_maps(np.zeros((4, 2)), np.zeros((4, 2)), pose), "initial guess"),
+        (lambda pose: to_first_map(pose, np.zeros((4, 3))), "T_map_session"),
+        (lambda pose: sample_particles(pose, 4, 1.0, 0.1, np.random.default_rng(1)), "start pose"),
+        (lambda pose: predict(np.zeros((4, 3)), pose, MotionNoise(), np.random.default_rng(1)), "odometry"),
+        (lambda pose: ParticleFilter(GRID, pose, MclSettings(), np.random.default_rng(1)), "start pose"),
+        (lambda pose: deskew_points(np.zeros((4, 2)), np.zeros(4), pose), "twist"),
+        (lambda pose: ScanMotion(pose), "twist"),
+    ],
+)
+def test_one_pose_is_asked_for_by_its_name(call, name, bad):
+    with pytest.raises(ValueError, match=rf"{name}.*: expected shape .*3\)"):
+        call(bad)
 
 
 @pytest.mark.parametrize(

@@ -3,6 +3,8 @@
 import copy
 import json
 import math
+from collections.abc import Callable
+from dataclasses import fields
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +15,7 @@ from safetensors.torch import save_file
 from torch import nn
 
 from rol import pix2pix
+from rol.pairs import PairSettings
 from rol.pix2pix import (
     Generator,
     Pix2PixError,
@@ -108,9 +111,9 @@ def test_first_weights_are_those_of_pix2pix_and_follow_from_the_seed_alone() -> 
     assert all(not m.bias.any() for m in one.modules() if getattr(m, "bias", None) is not None)
 
 
-@pytest.mark.parametrize(("ngf", "n_blocks"), [(0, 9), (8, -1)])
-def test_impossible_networks_are_refused(ngf: int, n_blocks: int) -> None:
-    with pytest.raises(Pix2PixError, match="ngf must be at least 1"):
+@pytest.mark.parametrize(("ngf", "n_blocks", "fault"), [(0, 9, "ngf: 0"), (8, -1, "n_blocks: -1")])
+def test_impossible_networks_are_refused(ngf: int, n_blocks: int, fault: str) -> None:
+    with pytest.raises(Pix2PixError, match=f"{fault} is not a whole number in"):
         build_generator(ngf, n_blocks, rng=seeded())
 
 
@@ -325,7 +328,7 @@ def test_rotations_are_averaged_and_turned_back() -> None:
         np.rot90(turned, -1).astype(int), generate(generator, image, tta_rotations=4).astype(int), atol=1
     )
     assert not np.array_equal(generate(generator, image), generate(generator, image, tta_rotations=4))
-    with pytest.raises(Pix2PixError, match="tta_rotations: expected 1 to 4, got 5"):
+    with pytest.raises(Pix2PixError, match=r"tta_rotations: 5 is not a whole number in \[1, 4\]"):
         generate(generator, image, tta_rotations=5)
 
 
@@ -420,12 +423,12 @@ HEADER = {"architecture": ResnetGenerator.description, "filters": 2, "blocks": 1
     [
         ("{", "header is not whole JSON"),
         ("[1]", r"header is \[1\], not a JSON object"),
-        (json.dumps({**HEADER, "filters": None}), "header: filters is None, expected a whole number"),
-        (json.dumps({**HEADER, "blocks": "1"}), "header: blocks is '1', expected a whole number"),
-        (json.dumps({**HEADER, "headings": 1.5}), "header: headings is 1.5, expected a whole number"),
+        (json.dumps({**HEADER, "filters": None}), "header: filters: None is not a whole number"),
+        (json.dumps({**HEADER, "blocks": "1"}), "header: blocks: '1' is not a whole number"),
+        (json.dumps({**HEADER, "headings": 1.5}), "header: headings: 1.5 is not a whole number"),
         (json.dumps({**HEADER, "image_size": 512}), "header: image_size is 512, expected two numbers"),
-        (json.dumps({**HEADER, "filters": 0}), "header: filters is 0, expected a whole number from 1"),
-        (json.dumps({**HEADER, "headings": 9}), "header: headings is 9, expected a whole number from 1 to 4"),
+        (json.dumps({**HEADER, "filters": 0}), r"header: filters: 0 is not a whole number in \[1, inf"),
+        (json.dumps({**HEADER, "headings": 9}), r"header: headings: 9 is not a whole number in \[1, 4\]"),
         (json.dumps({**HEADER, "filters": 10**9}), "tensors do not fit the header's architecture"),
     ],
 )
@@ -473,12 +476,34 @@ def test_header_that_promises_another_network_is_refused(tmp_path: Path) -> None
         ({"pairs_settings": [1]}, r"pairs_settings is \[1\], not a JSON object"),
         ({"points": {"threshold": "high"}}, "points: threshold is 'high', known are"),
         ({"points": {"radius": 3}}, "points: radius is 3, known are"),
+        ({"points": {"threshold": 300}}, r"points: threshold: 300 is not a whole number in \[0, 255\]"),
+        ({"pairs_settings": {"motion": "turned"}}, "pairs_settings: motion is 'turned', expected"),
+        ({"pairs_settings": {"width": 512.0}}, "pairs_settings: width: 512.0 is not a whole number"),
+        ({"pairs_settings": {"pixel_size": None}}, r"pairs_settings: pixel_size: None is not in \(0, inf\)"),
+        ({"pairs_settings": {"range_offset": [0.0]}}, r"pairs_settings: range_offset: \[0.0\] is not in"),
+        ({"pairs_settings": {"max_range": "far"}}, "pairs_settings: max_range: 'far' is not in"),
     ],
 )
 def test_header_with_other_points_is_refused(tmp_path: Path, header: dict, fault: str) -> None:
     save_weights(tmp_path / "net.safetensors", tiny_generator(), header)
     with pytest.raises(Pix2PixError, match=f"net.safetensors: header: {fault}"):
         load_network(tmp_path / "net.safetensors")
+
+
+@pytest.mark.parametrize("name", [field.name for field in fields(PairSettings)])
+@pytest.mark.parametrize("value", [-math.inf, -2.0, -1, 0, 0.5, 1, math.inf, True, None, "corrected", [1]])
+def test_header_and_pair_settings_refuse_the_same(tmp_path: Path, name: str, value: object) -> None:
+    def is_refused(make: Callable[[], object]) -> bool:
+        try:
+            make()
+        except ValueError as error:
+            assert name in str(error)
+            return True
+        return False
+
+    path = tmp_path / "net.safetensors"
+    save_weights(path, tiny_generator(), {"pairs_settings": {name: value, "session": "sim-a"}})
+    assert is_refused(lambda: load_network(path)) == is_refused(lambda: PairSettings(**{name: value}))
 
 
 def test_network_comes_with_its_threshold_and_image_settings(tmp_path: Path, weights: Path) -> None:

@@ -1,5 +1,6 @@
 """Augmentation: a rotated pair shows the rotated surroundings, gain, streaks and ghosts, joined sets."""
 
+import io
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -11,7 +12,7 @@ from rol.bev import image_to_points
 from rol.oxford import RadarScan
 from rol.pairs import AlignedScan, PairSettings
 from rol_beyond import augmentation
-from rol_beyond.augmentation import JoinedPairs, LidarClouds, ScanPairs, rotated_radar_image
+from rol_beyond.augmentation import JoinedPairs, LidarClouds, ScanPairs, gather_clouds, rotated_radar_image
 from rol_sim.session.oxford_files import save_radar
 
 AZIMUTHS = -2.0 * np.pi * (13 + 14 * np.arange(400)) / 5600
@@ -129,3 +130,21 @@ def test_joined_sets_count_on(tmp_path: Path) -> None:
         ScanPairs(
             pairs.session, pairs.aligned, LidarClouds(pairs.clouds.points, np.array([0, 1, 3])), SETTINGS
         )
+
+
+@pytest.mark.parametrize("kind", ["truncated", "array", "text", "other"])
+def test_a_broken_file_of_lidar_points_is_named_and_kept(tmp_path: Path, kind: str) -> None:
+    path, aligned = tmp_path / "clouds.npz", [AlignedScan(1, 2, 3, 4, (0.0, 0.0, 0.0))]
+    points, array = np.arange(2000, dtype=np.int16).reshape(-1, 2), io.BytesIO()
+    np.savez(path, points=points, starts=[0, 1000], about=repr((SETTINGS, aligned)))
+    assert len(gather_clouds(SimpleNamespace(), aligned, path, SETTINGS).points) == 1000
+    np.save(array, points)
+    broken = {"truncated": path.read_bytes()[:-100], "array": array.getvalue(), "text": b"x,y"}
+    if kind == "other":
+        np.savez(path, points=points)
+    else:
+        path.write_bytes(broken[kind])
+    content = path.read_bytes()
+    with pytest.raises(ValueError, match="clouds.npz: not a whole file of lidar points"):
+        gather_clouds(SimpleNamespace(), aligned, path, SETTINGS)
+    assert path.read_bytes() == content

@@ -2,8 +2,9 @@
 
 import importlib
 import pkgutil
+from collections.abc import Callable
 from dataclasses import dataclass, fields, is_dataclass, replace
-from typing import Any
+from typing import Any, get_type_hints
 
 import numpy as np
 import pytest
@@ -18,6 +19,7 @@ from rol.mcl import MclError, MclSettings, Measurement, MotionNoise, Resampling
 from rol.odometry import IcpSettings, OdometryError
 from rol.pairs import PairSettings
 from rol.pix2pix import Pix2PixError, TrainConfig
+from rol.training import RunOptions, TrainingError
 from rol_beyond.likelihood_field import LikelihoodField
 from rol_beyond.local_map_odometry import MapSettings
 from rol_beyond.motion import MotionModel
@@ -50,8 +52,8 @@ NAMES = (
 PACKAGES = (rol, rol_beyond, rol_sim, rol_study)
 
 
-def settings_classes() -> list[type]:
-    """All dataclasses with settings that are numbers."""
+def settings_classes(has_fields: Callable[[type], bool]) -> list[type]:
+    """All dataclasses with settings of some kind."""
     modules = [
         importlib.import_module(found.name)
         for package in PACKAGES
@@ -63,7 +65,7 @@ def settings_classes() -> list[type]:
         (
             one
             for one in classes
-            if isinstance(one, type) and one.__name__.endswith(NAMES) and has_numbers(one)
+            if isinstance(one, type) and one.__name__.endswith(NAMES) and has_fields(one)
         ),
         key=lambda one: one.__name__,
     )
@@ -79,7 +81,38 @@ def usual(kind: type) -> Any:
     return kind(**NEEDED.get(kind.__name__, {}))
 
 
-@pytest.mark.parametrize("kind", settings_classes(), ids=lambda kind: kind.__name__)
+def parts(kind: type) -> dict[str, type]:
+    """Fields that are settings classes themselves, or texts."""
+    return {name: one for name, one in get_type_hints(kind).items() if is_dataclass(one) or one is str}
+
+
+@pytest.mark.parametrize("kind", settings_classes(parts), ids=lambda kind: kind.__name__)
+def test_every_part_of_any_settings_is_of_its_class(kind: type) -> None:
+    settings = usual(kind)
+    for name, part in parts(kind).items():
+        for value in (None, part, IcpSettings if part is MotionNoise else MotionNoise()):
+            with pytest.raises(ValueError, match=rf"^{name}"):
+                replace(settings, **{name: value})
+
+
+def test_the_classes_with_parts_are_all_there() -> None:
+    names = {kind.__name__ for kind in settings_classes(parts)}
+    assert names == {
+        "KldResampling", "LocalMapSettings", "MclSettings", "PairSettings", "RecoverySettings", "ScanToMapSettings",
+        "SessionSettings", "SimulationSettings",
+    }  # fmt: skip
+
+
+def test_an_object_with_the_methods_of_a_part_can_replace_it() -> None:
+    class Exact:
+        def sample(self, increment: np.ndarray, n: int, rng: np.random.Generator) -> np.ndarray:
+            return np.tile(increment, (n, 1))
+
+    for motion in (Exact(), MotionModel()):
+        assert MclSettings(motion=motion).motion is motion
+
+
+@pytest.mark.parametrize("kind", settings_classes(has_numbers), ids=lambda kind: kind.__name__)
 def test_no_number_of_any_settings_may_be_nan(kind: type) -> None:
     settings, n = usual(kind), 0
     for field in fields(kind):
@@ -93,7 +126,7 @@ def test_no_number_of_any_settings_may_be_nan(kind: type) -> None:
 
 
 def test_the_classes_are_all_there() -> None:
-    names = {kind.__name__ for kind in settings_classes()}
+    names = {kind.__name__ for kind in settings_classes(has_numbers)}
     assert names == {
         "AdaptationConfig", "ConfirmationSettings", "DetectionSettings", "FailureRule", "FrontEnd", "IcpSettings", "KldResampling",
         "LidarSettings", "LikelihoodField", "MapSettings", "MclSettings", "Measurement", "MotionModel", "MotionNoise", "PairSettings",
@@ -113,7 +146,7 @@ def test_the_classes_are_all_there() -> None:
         (Measurement, {"cell_m": 0}, MclError, "cell_m: 0 is not"),
         (MclSettings, {"n_particles": 0}, MclError, r"n_particles: 0 is not a whole number in \[1, inf\)"),
         (MclSettings, {"n_particles": 3.5}, MclError, "n_particles: 3.5 is not a whole number"),
-        (Measurement, {"exponent": "20"}, MclError, "exponent: 20 is not in"),
+        (Measurement, {"exponent": "20"}, MclError, "exponent: '20' is not in"),
         (Measurement, {"exponent": True}, MclError, "exponent: True is not in"),
         (
             KldResampling,
@@ -143,6 +176,12 @@ def test_the_classes_are_all_there() -> None:
         (SimulationSettings, {"loop_m": 10.0}, SettingsError, r"loop_m: 10.0 is not in \[450, inf\)"),
         (SessionSettings, {"changed_share": 0.4}, SettingsError, r"changed_share: 0.4 is not in \[0, 0.3\]"),
         (SessionSettings, {"start": "noon"}, SettingsError, "start: 'noon' is not a date and time"),
+        (SessionSettings, {"start": None}, SettingsError, "start: expected str, got None"),
+        (MclSettings, {"measurement": Resampling()}, MclError, "measurement: expected Measurement, got Res"),
+        (RadarSettings, {"surfaces": {"WALL": 0.3}}, ValueError, "surfaces: WALL: expected Surface, got 0.3"),
+        (SimulationSettings, {"sessions": {"sim-a": {}}}, SettingsError, "sim-a: expected SessionSettings"),
+        (RunOptions, {"metadata": None}, TrainingError, "metadata: expected Mapping, got None"),
+        (IcpSettings, {"trim": (0.5, 0.5)}, OdometryError, r"trim: \(0.5, 0.5\) is not in"),
     ],
 )
 def test_values_out_of_range_are_named(kind: type, changes: dict, error: type, message: str) -> None:
