@@ -154,11 +154,10 @@ def check_fields(
     for span, names in allowed.items():
         for name in names.split():
             value = getattr(settings, name)
-            if isinstance(span, tuple):
-                if value not in span:
-                    raise error(f"{name}: {value!r} is none of {', '.join(span)}")
-            else:
+            if not isinstance(span, tuple):
                 check_number(name, value, span, kinds[name], error)
+            elif value not in span:
+                raise error(f"{name}: {value!r} is none of {', '.join(span)}")
 
 
 def _check_kind(name: str, value: Any, kind: Any, error: type[ValueError]) -> None:
@@ -452,5 +451,12 @@ def transform_points_3d(T_a_b: np.ndarray, points: np.ndarray) -> np.ndarray:
     -------
     points : array, shape (n, 3)
         The same points in frame a [m].
+
+    Raises
+    ------
+    ValueError
+        If the transform has another shape.
     """
+    if np.shape(T_a_b) != (4, 4):
+        raise ValueError(f"T_a_b: expected a transform of shape (4, 4), got {np.shape(T_a_b)}")
     return points @ T_a_b[:3, :3].T + T_a_b[:3, 3]

@@ -615,7 +615,7 @@ def load_network(path: str | Path) -> TrainedNetwork:
     return TrainedNetwork(_restore_generator(path, tensors, about), *_read_settings(path, about), about)
 
 
-# Settings of pairs in the header, in the ranges of `rol.pairs.PairSettings`, which needs more modules than a network.
+# Ranges of ``pairs_settings``: those of `rol.pairs.PairSettings`, which needs more modules than a network.
 _RANGES = {"width": "[1, inf)", "max_range": "(0, inf]", "min_height": "[-inf, inf)"}
 _RANGES |= dict.fromkeys(("range_resolution", "pixel_size"), "(0, inf)")
 _RANGES |= dict.fromkeys(("range_offset", "doppler_seconds"), "(-inf, inf)")
@@ -624,7 +624,7 @@ _RANGES |= dict.fromkeys(("range_offset", "doppler_seconds"), "(-inf, inf)")
 def _read_settings(path: str | Path, about: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
     """Read from the header how points and radar images are made; refuse other types and values out of range.
 
-    Other keys of ``pairs_settings`` are kept: `rol.pairs.pair_folder` adds its own.
+    Other keys of ``pairs_settings``, such as the name of the session, are kept.
     """
     defaults = {"threshold": 128, "thin": False}
     for name in ("points", "pairs_settings"):
@@ -635,12 +635,11 @@ def _read_settings(path: str | Path, about: dict[str, Any]) -> tuple[dict[str, A
         if type(value) is not type(defaults.get(name)):
             raise Pix2PixError(f"{path}: header: points: {name} is {value!r:.60}, known are {defaults}")
     check_number(f"{path}: header: points: threshold", points["threshold"], "[0, 255]", int, Pix2PixError)
-    where = f"{path}: header: pairs_settings"
     if (motion := pairs.get("motion", "none")) not in ("none", "corrected"):
-        raise Pix2PixError(f"{where}: motion is {motion!r:.60}, expected 'none' or 'corrected'")
+        raise Pix2PixError(f"{path}: header: pairs_settings: motion is {motion!r:.60}, not none or corrected")
     for name in (name for name in _RANGES if name in pairs):
-        kind = int if name == "width" else float
-        check_number(f"{where}: {name}", pairs[name], _RANGES[name], kind, Pix2PixError)
+        field = f"{path}: header: pairs_settings: {name}"
+        check_number(field, pairs[name], _RANGES[name], int if name == "width" else float, Pix2PixError)
     return points, pairs
 
 

@@ -172,6 +172,12 @@ def test_rotation_moves_the_axes_as_worked_out_by_hand(angles, forward, left, up
     assert_allclose(R, np.array([forward, left, up]).T, atol=1e-12)
 
 
+def test_transform_in_space_is_asked_for_by_its_name():
+    for bad in (np.zeros(3), np.eye(3)):
+        with pytest.raises(ValueError, match=r"T_a_b: expected a transform of shape \(4, 4\), got \(3"):
+            geometry.transform_points_3d(bad, np.zeros((2, 3)))
+
+
 def test_transform_from_euler_and_points_in_space():
     T = geometry.transform_from_euler(1, 2, 3, 0, 0, QUARTER)
     assert_allclose(

@@ -477,7 +477,7 @@ def test_header_that_promises_another_network_is_refused(tmp_path: Path) -> None
         ({"points": {"threshold": "high"}}, "points: threshold is 'high', known are"),
         ({"points": {"radius": 3}}, "points: radius is 3, known are"),
         ({"points": {"threshold": 300}}, r"points: threshold: 300 is not a whole number in \[0, 255\]"),
-        ({"pairs_settings": {"motion": "turned"}}, "pairs_settings: motion is 'turned', expected"),
+        ({"pairs_settings": {"motion": "turned"}}, "pairs_settings: motion is 'turned', not none"),
         ({"pairs_settings": {"width": 512.0}}, "pairs_settings: width: 512.0 is not a whole number"),
         ({"pairs_settings": {"pixel_size": None}}, r"pairs_settings: pixel_size: None is not in \(0, inf\)"),
         ({"pairs_settings": {"range_offset": [0.0]}}, r"pairs_settings: range_offset: \[0.0\] is not in"),
