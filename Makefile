@@ -41,7 +41,7 @@ book: $(STAMP)
 
 test: $(STAMP) lint
 	@mkdir -p build/test
-	@$(PYTEST) -n $(CORES) --ignore=tests/notebooks | tee build/test/unit.log
+	@$(PYTEST) -n $(CORES) --dist worksteal --ignore=tests/notebooks | tee build/test/unit.log
 	@$(MAKE) --no-print-directory book PROFILE=smoke
 	@$(PYTEST) -n $(CORES) --dist loadfile tests/notebooks | tee build/test/book.log
 	@echo

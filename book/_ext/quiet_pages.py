@@ -8,6 +8,7 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
+from docutils import nodes
 from sphinx.application import Sphinx
 
 # Preloading asks for each file by a rule that a page from the file system cannot keep; the second script only draws the
@@ -63,6 +64,16 @@ def clean_pages(app: Sphinx, exception: Exception | None) -> None:
             page.write_text(after)
 
 
+def forget_parts(app: Sphinx, doctree: nodes.document) -> None:
+    """Let every node name the page as its document (in place).
+
+    What stands in `eval-rst` was parsed as a document of its own, whose settings hold all that Sphinx knows; it would be
+    written to disk and read again with each of these pages.
+    """
+    for node in doctree.findall():
+        node.document = doctree
+
+
 def readable_defaults(
     app: Sphinx, what: str, name: str, obj: object, options: dict, arguments: str, returns: str
 ) -> tuple:
@@ -75,5 +86,6 @@ def setup(app: Sphinx) -> dict:
     app.connect("html-page-context", leave_out_scripts, priority=900)
     app.connect("html-page-context", point_to_stored, priority=901)
     app.connect("autodoc-process-signature", readable_defaults)
+    app.connect("doctree-read", forget_parts)
     app.connect("build-finished", clean_pages)
     return {"version": "1", "parallel_read_safe": True, "parallel_write_safe": True}

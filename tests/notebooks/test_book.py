@@ -7,7 +7,7 @@ from pathlib import Path
 from urllib.parse import unquote, urlsplit
 
 import pytest
-from bs4 import BeautifulSoup
+from bs4 import BeautifulSoup, Tag
 
 from chapters import SOURCE, book_pages
 
@@ -18,6 +18,18 @@ OF_THE_BUILDER = {"genindex.html", "search.html"}
 @cache
 def read_page(path: Path) -> BeautifulSoup:
     return BeautifulSoup(path.read_text(encoding="utf-8"), "html.parser")
+
+
+@cache
+def anchors_of(path: Path) -> set[str]:
+    named = read_page(path).find_all("a", attrs={"name": True})
+    return {tag["id"] for tag in read_page(path).find_all(id=True)} | {tag["name"] for tag in named}
+
+
+@cache
+def entries_of(path: Path) -> dict[str, Tag]:
+    """Find the heads of the entries of a page on a module, by the names of what they describe."""
+    return {head["id"]: head for head in read_page(path).find_all("dt", id=True)}
 
 
 @pytest.fixture
@@ -39,15 +51,18 @@ def test_every_chapter_has_its_page_with_a_title_of_its_own(profile: dict, html:
 
 
 def test_every_page_can_be_reached_from_the_first(html: Path) -> None:
-    side = read_page(html / "intro.html").find(class_="bd-links")
-    listed = {
-        (html / link["href"]).resolve() for link in side.find_all("a", href=True) if link["href"] != "#"
-    }
+    """By the lists of contents at the side: the one of the first page, and those of the pages that it names."""
+    reached = {html / "intro.html"}
+    left = list(reached)
+    while left:
+        page = left.pop()
+        side = read_page(page).find(class_="bd-links").find_all("a", href=True)
+        listed = {(page.parent / link["href"]).resolve() for link in side if link["href"] != "#"} - reached
+        left += listed
+        reached |= listed
     code = {page for page in pages_of(html) if "_modules" in page.relative_to(html).parts}
-    missing = {
-        page for page in pages_of(html) if page.name not in OF_THE_BUILDER | {"index.html", "intro.html"}
-    } - listed
-    assert not missing - code
+    missing = {page for page in pages_of(html) if page.name not in OF_THE_BUILDER} - code - reached
+    assert missing == {html / "index.html"}
 
 
 def test_every_internal_link_and_anchor_resolves(html: Path) -> None:
@@ -62,7 +77,7 @@ def test_every_internal_link_and_anchor_resolves(html: Path) -> None:
                 not target.is_file()
                 or parts.fragment
                 and target.suffix == ".html"
-                and not has_anchor(target, unquote(parts.fragment))
+                and unquote(parts.fragment) not in anchors_of(target)
             ):
                 broken.append((page.name, link["href"]))
     assert not broken
@@ -75,7 +90,7 @@ def test_every_public_name_has_signature_docstring_and_code(html: Path, file: Pa
     kinds = ast.FunctionDef | ast.ClassDef
     for member in ast.parse(file.read_text(encoding="utf-8")).body:
         if isinstance(member, kinds) and not member.name.startswith("_"):
-            head = read_page(page).find("dt", id=f"{module}.{member.name}")
+            head = entries_of(page).get(f"{module}.{member.name}")
             assert head is not None, f"{page.name}: {member.name} is missing"
             assert (
                 f"_modules/{'/'.join(parts)}.html#{member.name}"
@@ -84,13 +99,6 @@ def test_every_public_name_has_signature_docstring_and_code(html: Path, file: Pa
     for entry in read_page(page).select("dl.py"):
         assert entry.dd.get_text(strip=True), f"{page.name}: {entry.dt['id']} has no docstring"
     assert "np.float64(" not in read_page(page).article.get_text()
-
-
-def has_anchor(page: Path, name: str) -> bool:
-    return (
-        read_page(page).find(attrs={"id": name}) is not None
-        or read_page(page).find("a", attrs={"name": name}) is not None
-    )
 
 
 def test_every_image_exists_and_has_alt_text(html: Path) -> None:

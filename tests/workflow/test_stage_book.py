@@ -13,6 +13,8 @@ from types import ModuleType, SimpleNamespace
 import nbformat
 import pytest
 import yaml
+from docutils import nodes
+from docutils.utils import new_document
 from nbformat.v4 import new_notebook
 
 import chapters
@@ -242,6 +244,16 @@ def test_finished_pages_are_cleaned(quiet_pages: ModuleType, tmp_path: Path) -> 
     (tmp_path / "search.html").write_text(twice, encoding="utf-8")
     quiet_pages.clean_pages(app, RuntimeError("the build has failed"))
     assert (tmp_path / "search.html").read_text(encoding="utf-8") == twice
+
+
+def test_parts_forget_the_document_that_they_were_parsed_in(quiet_pages: ModuleType) -> None:
+    page, part, section = new_document("page"), new_document("part"), nodes.section()
+    part += section
+    section += nodes.paragraph("", "words")
+    page.extend(part.children)
+    assert page[0][0].document is part
+    quiet_pages.forget_parts(None, page)
+    assert all(node.document is page for node in page.findall())
 
 
 def test_default_that_is_made_anew_is_shown_as_dots(quiet_pages: ModuleType) -> None:
