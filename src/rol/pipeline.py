@@ -63,7 +63,9 @@ def scan_to_points(network: TrainedNetwork, scan: Any) -> np.ndarray:
     settings = PairSettings.from_dict({**network.settings, "motion": "none"})
     image = radar_to_image(scan.power, scan.azimuths, None, settings)
     extent = {"pixel_size": settings.pixel_size, "max_range": settings.max_range}
-    return image_to_points(generate(network.generator, image), **network.points, **extent, min_range=MIN_RANGE_M)
+    return image_to_points(
+        generate(network.generator, image), **network.points, **extent, min_range=MIN_RANGE_M
+    )
 
 
 class RadarLocalizer:
