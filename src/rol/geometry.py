@@ -148,7 +148,9 @@ def check_fields(
     ValueError
         Or the given ``error``, with the field's name, its value and what is allowed; NaN is in no range.
     """
-    kinds = get_type_hints(type(settings))
+    # The annotations are text; their names are those of the module, also where it runs under another name.
+    hook = getattr(type(settings), "__post_init__", None)
+    kinds = get_type_hints(type(settings), getattr(hook, "__globals__", None))
     for name, kind in kinds.items():
         _check_kind(name, getattr(settings, name), kind, error)
     for span, names in allowed.items():

@@ -293,11 +293,23 @@ def test_entries_for_citing_are_those_of_the_bibliography() -> None:
     assert paper["title"] in entries[0] and str(paper["year"]) in entries[0]
 
 
+# Hides a package from the imports that follow.
+WITHOUT = """
+import sys
+class Without:
+    def __init__(self, package):
+        self.package = package
+    def find_spec(self, name, *_):
+        if name == self.package:
+            raise ModuleNotFoundError(f"No module named {name!r}")
+"""
+
+
 @pytest.mark.parametrize(("module", "missing"), [("mcl", "numba"), ("pipeline", "torch")])
 def test_a_missing_package_is_named(module: str, missing: str) -> None:
-    code = f"import sys; sys.modules[{missing!r}] = None; import rol.{module}"
+    code = f"{WITHOUT}sys.meta_path.insert(0, Without({missing!r}))\nimport rol.{module}"
     environment = {**os.environ, "PYTHONPATH": str(ROOT / "src")}
     answer = subprocess.run(
         [sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=False
     )
-    assert f"import of {missing} halted" in answer.stderr.splitlines()[-1]
+    assert f"No module named {missing!r}" in answer.stderr.splitlines()[-1]
