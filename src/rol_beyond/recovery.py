@@ -99,7 +99,8 @@ class RelocalizationSettings:
     max_range_m : float
         Points farther away are left out, as the heading is too uncertain for them [m].
     pause, trusted_pause, far_pause : int
-        Scans between two searches: near, near while the estimate is trusted, and far.
+        Scans between two searches: near, near while the estimate is trusted, and far. They are longer for a window that takes
+        longer to search, see `shortest_pause`.
     reach_m, reach_yaw : float
         Half the extent of the near search around the estimate [m, rad].
     far_after : int
@@ -138,6 +139,29 @@ class RelocalizationSettings:
             "[1, inf)": "workers",
         }
         check_fields(self, allowed)
+
+
+def shortest_pause(settings: RelocalizationSettings, is_far: bool) -> int:
+    """Compute the number of scans between two searches at which a lost filter stays faster than the radar.
+
+    The cost of a search grows with the area and the number of headings of its window. It is a fixed function of the settings,
+    and not measured while the filter runs, so the same scans always give the same estimates.
+
+    Parameters
+    ----------
+    settings : RelocalizationSettings
+        Windows.
+    is_far : bool
+        Whether the far search is meant.
+
+    Returns
+    -------
+    pause : int
+        2 scans for the near window of 30 m and 30 deg, 10 scans for the far one of 300 m. XXX
+    """
+    if is_far:
+        return int(np.ceil(10.0 * (settings.far_reach_m / 300.0) ** 2))
+    return int(np.ceil(2.0 * (settings.reach_m / 30.0) ** 2 * settings.reach_yaw / np.deg2rad(30.0)))
 
 
 @dataclass(frozen=True)
@@ -591,6 +615,7 @@ class RecoveringFilter:
         settings, detection = self.recovery.relocalization, self.recovery.detection
         pause = settings.trusted_pause if self.is_trusted else settings.pause
         pause = settings.far_pause if self.is_far else pause
+        pause = max(pause, shortest_pause(settings, self.is_far))
         if self.since_search < pause or len(self.clouds) < detection.n_scans:
             return False
         return not self.is_far or self.searched_m >= detection.moved_m * detection.n_scans

@@ -14,6 +14,7 @@ from rol_beyond.recovery import (
     RecoverySettings,
     RelocalizationSettings,
     measure_reference_contrast,
+    shortest_pause,
 )
 from rol_beyond.robust import settings_for
 
@@ -110,6 +111,33 @@ def test_a_start_off_the_map_is_held(drive: tuple) -> None:
     low, high = points.min(axis=0), points.max(axis=0)
     np.testing.assert_allclose(update.pose[:2], (high[0] + 64.0, low[1] - 64.0))
     assert update.is_lost and np.isfinite(update.covariance).all()
+
+
+@pytest.mark.parametrize("is_far", [False, True])
+def test_a_larger_window_is_searched_less_often(is_far: bool) -> None:
+    default = RelocalizationSettings()
+    pause = default.far_pause if is_far else default.pause
+    assert shortest_pause(default, is_far) <= pause  # the defaults are as they were
+    twice = RelocalizationSettings(reach_m=60.0, far_reach_m=600.0)
+    assert shortest_pause(twice, is_far) == 4 * shortest_pause(default, is_far)
+    turned = RelocalizationSettings(reach_yaw=np.deg2rad(60.0))
+    assert shortest_pause(turned, is_far) == (1 if is_far else 2) * shortest_pause(default, is_far)
+
+
+def test_searches_keep_the_shortest_pause(drive: tuple) -> None:
+    def run_lost(reach_m: float) -> list[int]:
+        """Scans at which the near window is searched by a filter that starts far away."""
+        points, poses, increments, clouds = drive
+        settings = RelocalizationSettings(reach_m=reach_m, far_after=1000)
+        recovery, rng = RecoverySettings(0.3, relocalization=settings), np.random.default_rng(1)
+        robust_filter = RecoveringFilter(points, poses[0] + (90.0, 40.0, 2.0), SETTINGS, recovery, rng)
+        searched = []
+        for index, _ in enumerate(localize(robust_filter, increments, clouds)):
+            searched += [index] if robust_filter.since_search == 0 else []
+        return searched
+
+    for reach_m, pause in ((10.0, 2), (45.0, 5)):
+        assert np.diff(run_lost(reach_m)).min() == pause
 
 
 def test_same_seed_same_track(drive: tuple) -> None:
