@@ -285,15 +285,16 @@ def _find_peaks(values: np.ndarray, n: int, block: int) -> tuple[np.ndarray, np.
     size = -(-len(values) // block)
     padded = np.full((size * block, size * block), -np.inf, dtype=values.dtype)
     padded[: len(values), : len(values)] = values
-    blocks = (
-        padded.reshape(size, block, size, block).transpose(0, 2, 1, 3).reshape(size * size, block * block)
-    )
-    inside, which = blocks.argmax(axis=1), np.arange(size * size)
-    heights = blocks[which, inside]
-    order = np.argsort(-heights, kind="stable")[:n]
+    blocks = padded.reshape(size, block, size, block)
+    rows = blocks.max(axis=1)
+    maxima = np.maximum.reduce([rows[..., k] for k in range(block)]).ravel()
+    # Only those that can be among the n highest are sorted; equal ones stay in their order.
+    n = min(n, len(maxima))
+    high = np.flatnonzero(maxima >= np.partition(maxima, len(maxima) - n)[len(maxima) - n])
+    which = high[np.argsort(-maxima[high], kind="stable")[:n]]
+    inside = blocks[which // size, :, which % size].reshape(n, -1).argmax(axis=1)
     rows, columns = np.divmod(inside, block)
-    cells = np.column_stack([which // size * block + rows, which % size * block + columns])
-    return cells[order], heights[order]
+    return np.column_stack([which // size * block + rows, which % size * block + columns]), maxima[which]
 
 
 def _refine(

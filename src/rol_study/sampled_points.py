@@ -31,6 +31,27 @@ class SampledPointsError(ValueError):
     """No points can be sampled from the map or the poses, or no mixture has the given fractions."""
 
 
+class DenseMapError(SampledPointsError):
+    """The map is so dense that more points lie near it by chance than asked.
+
+    Attributes
+    ----------
+    chance_1m, chance_2m : float
+        Fractions of points thrown at random that lie within 1 m and 2 m of the map.
+    least_2m : float
+        Smallest fraction within 2 m that points with the fraction asked within 1 m can have; NaN where that is below
+        ``chance_1m``.
+    """
+
+    def __init__(self, message: str, chance_1m: float, chance_2m: float, least_2m: float) -> None:
+        super().__init__(message)
+        self.chance_1m, self.chance_2m, self.least_2m = chance_1m, chance_2m, least_2m
+
+    def __reduce__(self) -> tuple:
+        """Pickle with all arguments, as the error may be raised in another process."""
+        return type(self), (str(self), self.chance_1m, self.chance_2m, self.least_2m)
+
+
 @dataclass(frozen=True)
 class FrontEnd:
     """Properties of a front end's points.
@@ -205,16 +226,31 @@ def solve_mixture(fractions: np.ndarray, fraction_1m: float, fraction_2m: float)
 
     Raises
     ------
+    DenseMapError
+        If points thrown at random lie near the map so often that a mixture would need fewer than none of the other kinds.
     SampledPointsError
-        If no mixture has these fractions.
+        If no mixture has these fractions for another reason.
     """
+    fractions = np.asarray(fractions, dtype=np.float64)
     weights = np.linalg.solve(np.vstack([fractions, np.ones(3)]), [fraction_1m, fraction_2m, 1.0])
+    asked = f"{fraction_1m:.2f} within 1 m and {fraction_2m:.2f} within 2 m"
     if (weights < -1e-9).any():
+        if weights[2] >= 0.0 and fraction_1m <= fractions[0, 0]:
+            raise _dense_map(fractions, fraction_1m, asked)
         told = ", ".join(f"{kind} {weight:.2f}" for kind, weight in zip(KINDS, weights, strict=True))
-        raise SampledPointsError(
-            f"no mixture of points has {fraction_1m:.2f} within 1 m and {fraction_2m:.2f} within 2 m here: it would need {told}"
-        )
+        raise SampledPointsError(f"no mixture of points has {asked} here: it would need {told}")
     return np.clip(weights, 0.0, 1.0)
+
+
+def _dense_map(fractions: np.ndarray, fraction_1m: float, asked: str) -> DenseMapError:
+    """Make the error for a map with too many points near it by chance; arguments as for `solve_mixture`."""
+    near, chance = fractions[:, 0], fractions[:, 2]
+    false = (near[0] - fraction_1m) / (near[0] - chance[0])
+    least_2m = near[1] + false * (chance[1] - near[1]) if fraction_1m >= chance[0] else float("nan")
+    found = f"by chance {chance[0]:.2f} and {chance[1]:.2f} are"
+    least = f"; with {fraction_1m:.2f} within 1 m at least {least_2m:.2f} are within 2 m"
+    message = f"the map is too dense for points with {asked}: {found}{least if np.isfinite(least_2m) else ''}"
+    return DenseMapError(message, *map(float, (*chance, least_2m)))
 
 
 def measure_fractions(

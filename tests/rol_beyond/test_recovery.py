@@ -14,6 +14,7 @@ from rol_beyond.recovery import (
     RecoverySettings,
     RelocalizationSettings,
     measure_reference_contrast,
+    shortest_pause,
 )
 from rol_beyond.robust import settings_for
 
@@ -74,6 +75,70 @@ def test_an_unknown_start_is_searched_globally(drive: tuple) -> None:
     start = np.array([5.0, -20.0, 2.0])  # the vehicle is 32 m from here, and turned by 2 rad
     off, updates = run(drive, start, is_start_known=False)
     assert off[-1] < 1.0 and not updates[-1].is_lost and updates[0].is_lost
+
+
+def drive_off(drive: tuple, max_outside_m: float) -> tuple[np.ndarray, np.ndarray]:
+    """Follow the drive, then odometry that leaves the map by 700 m and returns; estimates and reports of being lost."""
+    points, poses, increments, clouds = drive
+    steps = np.concatenate([np.tile((8.0, 0.0, 0.0), (100, 1)), np.tile((-8.0, 0.0, 0.0), (100, 1))])
+    reference = measure_reference_contrast(clouds[::5], poses[::5], FIELD.build_grid(points))
+    recovery = RecoverySettings(
+        reference, max_outside_m=max_outside_m, relocalization=RelocalizationSettings(far_reach_m=60.0)
+    )
+    robust_filter = RecoveringFilter(points, poses[0], SETTINGS, recovery, np.random.default_rng(1))
+    increments = np.concatenate([increments, steps])
+    updates = list(localize(robust_filter, increments, [*clouds, *[np.zeros((0, 2))] * 200]))
+    return np.array([u.pose for u in updates]), np.array([u.is_lost for u in updates])
+
+
+def test_an_estimate_off_the_map_is_held_and_reported(drive: tuple) -> None:
+    low, high = drive[0].min(axis=0), drive[0].max(axis=0)
+    free, _ = drive_off(drive, np.inf)
+    held, is_lost = drive_off(drive, 64.0)
+    np.testing.assert_array_equal(held[:70], free[:70])  # on the map nothing changes, to the last bit
+    assert (free[:, :2] > high + 500.0).any() and (held[:, :2] <= high + 64.0).all()
+    assert (held[:, :2] >= low - 64.0).all() and is_lost[-1]
+    at_border = (held[:, :2] == high + 64.0).any(axis=1)
+    assert at_border.sum() > 50 and is_lost[at_border].all()
+    assert not at_border[-10:].any() and np.hypot(*(held[-1] - drive[1][-1])[:2]) < 30.0  # it has returned
+
+
+def test_a_start_off_the_map_is_held(drive: tuple) -> None:
+    points, _, _, clouds = drive
+    recovery, rng = RecoverySettings(0.1), np.random.default_rng(1)
+    robust_filter = RecoveringFilter(points, np.array([9e5, -9e5, 0.0]), SETTINGS, recovery, rng)
+    update = robust_filter.step(clouds[0])
+    low, high = points.min(axis=0), points.max(axis=0)
+    np.testing.assert_allclose(update.pose[:2], (high[0] + 64.0, low[1] - 64.0))
+    assert update.is_lost and np.isfinite(update.covariance).all()
+
+
+def test_a_larger_window_is_searched_less_often() -> None:
+    default = RelocalizationSettings()
+    assert [shortest_pause(default, is_far) for is_far in (False, True)] == [2, 16]
+    assert (
+        default.pause == 2 and default.far_pause > 16
+    )  # the default windows are searched as often as before
+    wide = RelocalizationSettings(reach_m=120.0, far_reach_m=660.0)
+    assert [shortest_pause(wide, is_far) for is_far in (False, True)] == [8, 40]
+    turned = RelocalizationSettings(reach_yaw=np.deg2rad(60.0), max_range_m=np.inf)
+    assert [shortest_pause(turned, is_far) for is_far in (False, True)] == [7, 18]
+
+
+def test_searches_keep_the_shortest_pause(drive: tuple) -> None:
+    def run_lost(reach_m: float) -> list[int]:
+        """Scans at which the near window is searched by a filter that starts far away."""
+        points, poses, increments, clouds = drive
+        settings = RelocalizationSettings(reach_m=reach_m, far_after=1000)
+        recovery, rng = RecoverySettings(0.3, relocalization=settings), np.random.default_rng(1)
+        robust_filter = RecoveringFilter(points, poses[0] + (90.0, 40.0, 2.0), SETTINGS, recovery, rng)
+        searched = []
+        for index, _ in enumerate(localize(robust_filter, increments, clouds)):
+            searched += [index] if robust_filter.since_search == 0 else []
+        return searched
+
+    for reach_m, pause in ((10.0, 2), (75.0, 5)):
+        assert np.diff(run_lost(reach_m)).min() == pause
 
 
 def test_same_seed_same_track(drive: tuple) -> None:

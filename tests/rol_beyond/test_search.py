@@ -10,6 +10,7 @@ from rol_beyond.likelihood_field import build_likelihood_field
 from rol_beyond.search import (
     CorrelationGrid,
     SearchSettings,
+    _find_peaks,
     merge_clouds,
     remove_ego_static_points,
     score_contrast,
@@ -105,3 +106,16 @@ def test_nothing_is_found_from_nothing() -> None:
     assert poses.shape == (0, 3) and contrast.shape == (0,)
     with pytest.raises(ValueError, match="centre of the search"):
         search_poses(np.zeros((1, 2)), grid, grid, np.array([0.0, np.nan, 0.0]), SearchSettings(10.0))
+
+
+@pytest.mark.parametrize(("size", "n", "block"), [(41, 30, 2), (41, 10, 8), (7, 100, 3)])
+@pytest.mark.parametrize("n_levels", [3, 10**6])  # with few levels many blocks are equally high
+def test_peaks_are_the_highest_of_the_block_maxima(size: int, n: int, block: int, n_levels: int) -> None:
+    values = np.random.default_rng(4).integers(-n_levels, n_levels, (size, size)).astype(np.float32)
+    cells, heights = _find_peaks(values, n, block)
+    corners = [(i, j) for i in range(0, size, block) for j in range(0, size, block)]
+    maxima = np.array([values[i : i + block, j : j + block].max() for i, j in corners])
+    order = np.argsort(-maxima, kind="stable")[:n]
+    np.testing.assert_array_equal(heights, maxima[order])
+    np.testing.assert_array_equal(values[cells[:, 0], cells[:, 1]], heights)
+    np.testing.assert_array_equal(cells // block * block, np.array(corners)[order])

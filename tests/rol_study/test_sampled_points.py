@@ -1,11 +1,14 @@
 """Points of given precision sampled from a map: visible cells, mixture of kinds, resulting fractions."""
 
+import pickle
+
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
 from rol.geometry import transform_points
 from rol_study.sampled_points import (
+    DenseMapError,
     FrontEnd,
     SampledPointsError,
     find_visible_points,
@@ -40,10 +43,30 @@ def test_mixture_has_the_given_fractions() -> None:
     mixture = solve_mixture(fractions, 0.4, 0.6)
     # 0.16 + 0.3 * 0.8 = 0.4, and 0.16 + 0.04 + 0.5 * 0.8 = 0.6
     np.testing.assert_allclose(mixture, [0.16, 0.04, 0.8])
-    with pytest.raises(
-        SampledPointsError, match="0.10 within 1 m and 0.20 within 2 m here: it would need near -0"
-    ):
-        solve_mixture(fractions, 0.1, 0.2)
+    fractions[0, 0] = 0.9
+    words = "0.95 within 1 m and 0.99 within 2 m here: it would need near 1.05, beside -0.07, false 0.02"
+    with pytest.raises(SampledPointsError, match=words) as caught:
+        solve_mixture(fractions, 0.95, 0.99)
+    assert not isinstance(caught.value, DenseMapError)
+
+
+@pytest.mark.parametrize(
+    ("asked", "least_2m"),
+    [((0.1, 0.2), np.nan), ((0.25, 0.45), np.nan), ((0.4, 0.49), 0.571), ((0.9, 0.91), 0.929)],
+)
+def test_a_map_that_is_too_dense_is_named_with_its_chance(
+    asked: tuple[float, float], least_2m: float
+) -> None:
+    fractions = np.array([[1.0, 0.0, 0.3], [1.0, 1.0, 0.5]])
+    words = f"too dense for points with {asked[0]:.2f} within 1 m and {asked[1]:.2f} within 2 m: by chance 0.30 and 0.50"
+    with pytest.raises(DenseMapError, match=words) as caught:
+        solve_mixture(fractions, *asked)
+    copy = pickle.loads(pickle.dumps(caught.value))  # as a worker process hands it on
+    assert (copy.chance_1m, copy.chance_2m) == (0.3, 0.5) and str(copy) == str(caught.value)
+    assert copy.least_2m == pytest.approx(least_2m, abs=1e-3, nan_ok=True)
+    if np.isfinite(least_2m):
+        mixture = solve_mixture(fractions, asked[0], copy.least_2m + 1e-9)
+        assert mixture[1] == pytest.approx(0.0, abs=1e-6)
 
 
 @pytest.mark.parametrize(("fraction_1m", "fraction_2m"), [(0.4, 0.6), (0.8, 0.9)])
