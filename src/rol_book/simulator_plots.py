@@ -133,7 +133,7 @@ def draw_lidar_statistics(found: Mapping[str, dict]) -> Figure:
     Parameters
     ----------
     found : mapping
-        Name of a set -> its statistics, from `rol_study.lidar_statistics.compare_sweeps`; two sets at most, and parts
+        Name of a set -> its statistics, from `rol_study.lidar_statistics.compare_sweeps`, of the left lidar; two sets at most, and parts
         of the first one, whose curves are thin: they show how much the statistics vary within it.
 
     Returns
@@ -155,7 +155,8 @@ def draw_lidar_statistics(found: Mapping[str, dict]) -> Figure:
             extent=(0, 360, 32, 0),
             interpolation="nearest",
         )
-        ax.set(title=name, xlabel="angle [deg]", xticks=np.arange(0, 361, 90), yticks=(0, 8, 16, 24, 31))
+        ax.set(title=name, xlabel="direction", yticks=(0, 8, 16, 24, 31))
+        ax.set_xticks(np.arange(0, 361, 90), ["right", "behind", "left", "ahead", "right"])
         ax.grid(False)
     maps[0].set_ylabel("laser, highest on top")
     above.colorbar(image, ax=maps, label="fraction of beams that return", pad=0.01)
@@ -170,7 +171,7 @@ def draw_lidar_statistics(found: Mapping[str, dict]) -> Figure:
 
 def _draw_sweep_curves(axes: Sequence[Axes], statistics: dict, look: dict) -> None:
     axes[0].plot(statistics["laser_counts"], np.arange(32), **look)
-    axes[0].set(xlabel="points per sweep", ylabel="laser, highest on top", xlim=(0, None), ylim=(31.5, -0.5))
+    axes[0].set(xlabel="points per sweep", ylabel="laser, highest on top", xlim=(0, 1100), ylim=(31.5, -0.5))
     labels = {"ranges": "range [m]", "heights": "height above radar [m]", "intensities": "intensity"}
     for ax, (name, label) in zip(axes[1:], labels.items(), strict=True):
         fractions, edges = statistics["histograms"][name], statistics["edges"][name]

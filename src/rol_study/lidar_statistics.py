@@ -132,7 +132,9 @@ def recover_beams(points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarra
 def angle_step(angles_deg: np.ndarray) -> float:
     """Estimate the angle between two firings [deg] from the distinct angles, rounded to 0.01 deg, of a sweep."""
     steps = np.diff(np.unique(np.rint(100.0 * np.asarray(angles_deg)).astype(int))) / 100.0
-    steps = steps[np.abs(steps - np.median(steps)) < 0.03] if len(steps) else steps  # no gaps, not the overlap
+    steps = (
+        steps[np.abs(steps - np.median(steps)) < 0.03] if len(steps) else steps
+    )  # no gaps, not the overlap
     return float(steps.mean()) if len(steps) else float("nan")
 
 
@@ -186,7 +188,9 @@ def range_noise(points: np.ndarray, range_limits_m: tuple[float, float] = (2.0, 
     order = np.lexsort((angles, lasers))
     lasers, angles, ranges = lasers[order], angles[order], ranges[order]
     is_next = (np.diff(lasers) == 0) & (np.diff(angles) < MAX_STEP_DEG)
-    is_used = is_next[:-1] & is_next[1:] & (ranges[1:-1] > range_limits_m[0]) & (ranges[1:-1] < range_limits_m[1])
+    is_used = (
+        is_next[:-1] & is_next[1:] & (ranges[1:-1] > range_limits_m[0]) & (ranges[1:-1] < range_limits_m[1])
+    )
     second = np.diff(ranges, 2)[is_used]
     return float(1.4826 * np.median(np.abs(second)) / np.sqrt(6.0)) if len(second) else float("nan")
 
@@ -342,7 +346,11 @@ def compare_sweeps(
     """
     middle = (len(real) + 1) // 2
     halves = dict(zip(HALVES, (real[:middle], real[-middle:]), strict=True)) if len(real) > 1 else {}
-    sets = ({REAL: real} if len(real) else {}) | halves | {name: sweeps for name, sweeps in others.items() if sweeps}
+    sets = (
+        ({REAL: real} if len(real) else {})
+        | halves
+        | {name: sweeps for name, sweeps in others.items() if sweeps}
+    )
     found = {name: sweep_statistics(sweeps, rng) for name, sweeps in sets.items()}
     references = dict.fromkeys(found, REAL) | dict(zip(HALVES, reversed(HALVES), strict=True)) | {REAL: ""}
     for name, statistics in found.items():
