@@ -36,6 +36,7 @@ NEAR_M = 1.9  # real returns nearer than this lie on the own car
 GROUND_M = -1.5  # points below this height in the radar frame count as ground, as in chapter 3
 CLEAR_DEG = (190.0, 250.0)  # where all lasers of the left lidar see past the car, without the seam at 180 deg
 STEEP_LASERS = slice(27, 32)  # they look down on the road within 5 m
+MAX_ERROR_DEG = 0.1  # of a point's elevation from that of its laser
 MAX_STEP_DEG = 0.45  # neighbours in angle are not farther apart
 EDGES = {
     "ranges": np.concatenate([np.arange(1.0, 20.0, 1.0), np.arange(20.0, 106.0, 5.0)]),
@@ -85,7 +86,7 @@ def load_left_sweeps(session: Session, count: int) -> list[np.ndarray]:
     Returns
     -------
     sweeps : list of array, shape (n, 4), float32
-        In order of time; empty for a session without a left lidar.
+        In order of time; empty for a session without a left lidar, or with one that is no HDL-32E.
 
     Raises
     ------
@@ -93,7 +94,8 @@ def load_left_sweeps(session: Session, count: int) -> list[np.ndarray]:
         If a file is at fault.
     """
     stamps = usable_sweeps(session).get("left", np.zeros(0, dtype=np.int64))
-    return [load_sweep(session, SENSOR, int(us))[0] for us in _choose_evenly(stamps, count)]
+    sweeps = [load_sweep(session, SENSOR, int(us))[0] for us in _choose_evenly(stamps, count)]
+    return sweeps if all(_elevation_error(points) < MAX_ERROR_DEG for points in sweeps) else []
 
 
 def recover_beams(points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -118,15 +120,14 @@ def recover_beams(points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarra
     ValueError
         If a point is farther than 0.1 deg from the elevation of every laser: another frame or another lidar.
     """
-    xyz = np.asarray(points)[:, :3].astype(np.float64) - [0.0, 0.0, FIRE_HEIGHT]
-    ranges = np.linalg.norm(xyz, axis=1)
-    elevations = np.arcsin(-xyz[:, 2] / np.maximum(ranges, 1e-9))
-    after = np.clip(np.searchsorted(ELEVATIONS_DOWN, elevations), 1, len(ELEVATIONS_DOWN) - 1)
-    lasers = after - (elevations - ELEVATIONS_DOWN[after - 1] < ELEVATIONS_DOWN[after] - elevations)
-    off = np.rad2deg(np.abs(elevations - ELEVATIONS_DOWN[lasers]).max(initial=0.0))
-    if off > 0.1:
-        raise ValueError(f"points: not in the frame of an HDL-32E: one is {off:.2f} deg off every laser")
-    return lasers, np.rad2deg(np.arctan2(xyz[:, 0], xyz[:, 1])) % 360.0, ranges
+    xyz, ranges, elevations = _view_from_lasers(points)
+    error_deg = _elevation_error(points)
+    if error_deg > MAX_ERROR_DEG:
+        raise ValueError(
+            f"points: not in the frame of an HDL-32E: one is {error_deg:.2f} deg off every laser"
+        )
+    angles_deg = np.rad2deg(np.arctan2(xyz[:, 0], xyz[:, 1])) % 360.0
+    return _nearest_lasers(elevations), angles_deg, ranges
 
 
 def angle_step(angles_deg: np.ndarray) -> float:
@@ -405,6 +406,27 @@ def summarize_sweeps(statistics: dict) -> dict[str, float]:
 def _choose_evenly(items: np.ndarray, count: int) -> np.ndarray:
     """Choose at most so many items, evenly spaced from the first to the last."""
     return items[np.unique(np.linspace(0, len(items) - 1, min(count, len(items))).astype(int))]
+
+
+def _view_from_lasers(points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Places, ranges [m] and elevations (down) [rad] of points as seen from the lasers' centre."""
+    xyz = np.asarray(points)[:, :3].astype(np.float64) - [0.0, 0.0, FIRE_HEIGHT]
+    ranges = np.linalg.norm(xyz, axis=1)
+    return xyz, ranges, np.arcsin(-xyz[:, 2] / np.maximum(ranges, 1e-9))
+
+
+def _nearest_lasers(elevations: np.ndarray) -> np.ndarray:
+    """Number of the laser nearest to each elevation."""
+    after = np.clip(np.searchsorted(ELEVATIONS_DOWN, elevations), 1, len(ELEVATIONS_DOWN) - 1)
+    return after - (elevations - ELEVATIONS_DOWN[after - 1] < ELEVATIONS_DOWN[after] - elevations)
+
+
+def _elevation_error(points: np.ndarray) -> float:
+    """Greatest difference between a point's elevation and that of the nearest laser [deg]."""
+    elevations = _view_from_lasers(points)[2]
+    return float(
+        np.rad2deg(np.abs(elevations - ELEVATIONS_DOWN[_nearest_lasers(elevations)]).max(initial=0.0))
+    )
 
 
 def _heights(points: np.ndarray) -> np.ndarray:

@@ -141,3 +141,6 @@ def test_left_sweeps_of_a_session_are_evenly_chosen(tmp_path: Path) -> None:
     (session / "radar").mkdir()
     assert len(statistics.load_left_sweeps(open_session(session), 3)) == 3
     assert len(statistics.load_left_sweeps(open_session(session), 9)) == 5
+    other = points_of(box_sweep(rng)) + [0.0, 0.0, 0.3, 0.0]  # a lidar with other elevations
+    oxford_files.save_velodyne_binary(session / LIDARS[0] / f"{stamps[2]}.bin", other)
+    assert statistics.load_left_sweeps(open_session(session), 5) == []
