@@ -32,9 +32,10 @@ SWEEPS_PATH = Path("oxford_car_visualiser2/data")  # the real sweeps, below the 
 SENSOR = "velodyne_left"
 REAL, HALVES = "real: one street", ("its first half", "its second half")
 AZIMUTH_CELLS = 72  # of 5 deg
+SEAM_CELL = AZIMUTH_CELLS // 2  # sweeps begin and end at 180 to 184 deg
 NEAR_M = 1.9  # real returns nearer than this lie on the own car
 GROUND_M = -1.5  # points below this height in the radar frame count as ground, as in chapter 3
-CLEAR_DEG = (190.0, 250.0)  # where all lasers of the left lidar see past the car, without the seam at 180 deg
+CLEAR_DEG = (190.0, 250.0)  # where all lasers of the left lidar see past the car; no sweep begins there
 STEEP_LASERS = slice(27, 32)  # they look down on the road within 5 m
 MAX_ERROR_DEG = 0.1  # of a point's elevation from that of its laser
 MAX_STEP_DEG = 0.45  # neighbours in angle are not farther apart
@@ -144,27 +145,32 @@ def first_angle(lasers: np.ndarray, angles_deg: np.ndarray) -> float:
     return float(angles_deg[np.argmax(lasers == np.bincount(lasers).argmax())])
 
 
-def return_fractions(sweeps: Sequence[np.ndarray]) -> np.ndarray:
-    """Compute which fraction of the beams returns from beyond the own car.
+def return_fractions(sweeps: Sequence[np.ndarray], min_range_m: float = NEAR_M) -> np.ndarray:
+    """Compute which fraction of the beams returns from beyond a range.
 
     Parameters
     ----------
     sweeps : sequence of array, shape (n, 4)
         Sweeps.
+    min_range_m : float
+        Nearer returns are left out, such as those from the own car [m].
 
     Returns
     -------
     fractions : array, shape (32, 72)
-        By laser and 5 deg of angle. The overlap at a sweep's seam can raise a cell above 1.
+        By laser and 5 deg of angle. Firings are counted where a sweep begins and ends, since two sweeps differ by a
+        packet there, and follow from the step elsewhere, since firings without a return leave no trace.
     """
-    counts, firings = np.zeros((len(ELEVATIONS_DOWN), AZIMUTH_CELLS)), 0.0
+    counts, firings = np.zeros((len(ELEVATIONS_DOWN), AZIMUTH_CELLS)), np.zeros(AZIMUTH_CELLS)
     for points in sweeps:
         lasers, angles, ranges = recover_beams(points)
-        is_far = ranges > NEAR_M
         cells = (angles * AZIMUTH_CELLS / 360.0).astype(int)
+        is_far = ranges > min_range_m
         np.add.at(counts, (lasers[is_far], cells[is_far]), 1.0)
-        firings += 360.0 / AZIMUTH_CELLS / angle_step(angles)
-    return counts / firings
+        own = np.full(AZIMUTH_CELLS, 360.0 / AZIMUTH_CELLS / angle_step(angles))
+        own[SEAM_CELL] = len(np.unique(np.rint(100.0 * angles[cells == SEAM_CELL])))
+        firings += own
+    return counts / np.maximum(firings, 1.0)
 
 
 def range_noise(points: np.ndarray, range_limits_m: tuple[float, float] = (2.0, 20.0)) -> float:
@@ -281,7 +287,7 @@ def sweep_statistics(sweeps: Sequence[np.ndarray], rng: np.random.Generator, *, 
         "step_deg"; "first_angles_deg": array, shape (n_sweeps,); "return_fractions": array, shape (32, 72);
         "no_return": fraction of all beams without a point beyond the car; "blocked": fraction of the cells of
         laser and angle in which less than 2 % of the beams return; "steep_returns": fraction of beams of the five steepest lasers
-        that return beside the car; "near": fraction of points on the own car; "ground": fraction of the other
+        that return beside the car; "near": fraction of points within 1.9 m; "ground": fraction of the other
         points that are ground; "range_noise_m", "ground_noise_m", "wall_noise_m" [m]; "ground_intensity",
         "other_intensity": medians; "reach_m": range below which 99.9 % of the points lie; "max_range_m"; "histograms"
         and their "edges".
@@ -309,7 +315,7 @@ def sweep_statistics(sweeps: Sequence[np.ndarray], rng: np.random.Generator, *, 
         "return_fractions": fractions,
         "no_return": float(1.0 - fractions.mean()),
         "blocked": float((fractions < 0.02).mean()),
-        "steep_returns": float(fractions[STEEP_LASERS, beside].mean()),
+        "steep_returns": float(return_fractions(sweeps, 0.0)[STEEP_LASERS, beside].mean()),
         "near": float(1.0 - is_far.mean()),
         "ground": float(is_ground[is_far].mean()),
         "range_noise_m": float(np.mean([range_noise(sweep) for sweep in chosen])),
@@ -395,7 +401,7 @@ def summarize_sweeps(statistics: dict) -> dict[str, float]:
         "residual to planes, walls [mm]": 1e3 * statistics["wall_noise_m"],
         "median intensity, ground": statistics["ground_intensity"],
         "median intensity, else": statistics["other_intensity"],
-        "points on the own car [%]": 100.0 * statistics["near"],
+        f"points within {NEAR_M} m [%]": 100.0 * statistics["near"],
         "ground, of the other points [%]": 100.0 * statistics["ground"],
         "range that 99.9 % do not exceed [m]": statistics["reach_m"],
         "greatest range [m]": statistics["max_range_m"],
