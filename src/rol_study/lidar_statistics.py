@@ -303,8 +303,6 @@ def sweep_statistics(sweeps: Sequence[np.ndarray], rng: np.random.Generator, *, 
     lasers, _, ranges = (np.concatenate(parts) for parts in zip(*beams, strict=True))
     points, is_far, fractions = np.concatenate(sweeps), ranges > NEAR_M, return_fractions(sweeps)
     is_ground = _heights(points) < GROUND_M
-    chosen = [sweeps[i] for i in _choose_evenly(np.arange(len(sweeps)), n_noise)]
-    planes = [plane_noise(sweep, rng) for sweep in chosen]
     beside = slice(*(round(angle * AZIMUTH_CELLS / 360.0) for angle in CLEAR_DEG))
     return {
         "sweeps": len(sweeps),
@@ -318,9 +316,7 @@ def sweep_statistics(sweeps: Sequence[np.ndarray], rng: np.random.Generator, *, 
         "steep_returns": float(return_fractions(sweeps, 0.0)[STEEP_LASERS, beside].mean()),
         "near": float(1.0 - is_far.mean()),
         "ground": float(is_ground[is_far].mean()),
-        "range_noise_m": float(np.mean([range_noise(sweep) for sweep in chosen])),
-        "ground_noise_m": float(np.nanmean([noise["ground"] for noise in planes])),
-        "wall_noise_m": float(np.nanmean([noise["walls"] for noise in planes])),
+        **_mean_noise([sweeps[i] for i in _choose_evenly(np.arange(len(sweeps)), n_noise)], rng),
         "ground_intensity": float(np.median(points[is_far & is_ground, 3])),
         "other_intensity": float(np.median(points[is_far & ~is_ground, 3])),
         "reach_m": float(np.percentile(ranges, 99.9)),
@@ -328,6 +324,14 @@ def sweep_statistics(sweeps: Sequence[np.ndarray], rng: np.random.Generator, *, 
         "histograms": histograms(sweeps),
         "edges": EDGES,
     }
+
+
+def _mean_noise(sweeps: Sequence[np.ndarray], rng: np.random.Generator) -> dict[str, float]:
+    """Mean noise of several sweeps [m]: of a range, and to planes on the ground and on walls."""
+    rows = [{"range": range_noise(sweep), **plane_noise(sweep, rng)} for sweep in sweeps]
+    names = {"range": "range_noise_m", "ground": "ground_noise_m", "walls": "wall_noise_m"}
+    values = {name: [row[kind] for row in rows if np.isfinite(row[kind])] for kind, name in names.items()}
+    return {name: float(np.mean(found)) if found else float("nan") for name, found in values.items()}
 
 
 def compare_sweeps(
