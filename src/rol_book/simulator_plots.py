@@ -141,7 +141,7 @@ def draw_lidar_statistics(found: Mapping[str, dict]) -> Figure:
     figure : Figure
         One map of the beams for each set above, four curves below.
     """
-    figure = plt.figure(figsize=(9.6, 6.0), dpi=84)
+    figure = plt.figure(figsize=(9.6, 6.0), dpi=72)
     above, below = figure.subfigures(2, 1, height_ratios=(1.0, 1.05))
     whole = {name: statistics for name, statistics in found.items() if not statistics["is_part"]}
     maps = above.subplots(1, len(whole), sharey=True, squeeze=False)[0]
