@@ -127,6 +127,60 @@ def draw_polar_pair(
     axes[-1].set_xlabel("range [m]")
 
 
+def draw_lidar_statistics(found: Mapping[str, dict]) -> Figure:
+    """Draw which beams return, and the histograms, of sets of lidar sweeps.
+
+    Parameters
+    ----------
+    found : mapping
+        Name of a set -> its statistics, from `rol_study.lidar_statistics.compare_sweeps`, of the left lidar; two sets at most, and parts
+        of the first one, whose curves are thin: they show how much the statistics vary within it.
+
+    Returns
+    -------
+    figure : Figure
+        One map of the beams for each set above, four curves below.
+    """
+    figure = plt.figure(figsize=(9.6, 6.0), dpi=72)
+    above, below = figure.subfigures(2, 1, height_ratios=(1.0, 1.05))
+    whole = {name: statistics for name, statistics in found.items() if not statistics["is_part"]}
+    maps = above.subplots(1, len(whole), sharey=True, squeeze=False)[0]
+    for ax, (name, statistics) in zip(maps, whole.items(), strict=True):
+        image = ax.imshow(
+            statistics["return_fractions"],
+            cmap="viridis",
+            aspect="auto",
+            vmin=0,
+            vmax=1,
+            extent=(0, 360, 32, 0),
+            interpolation="nearest",
+        )
+        ax.set(title=name, xlabel="direction", yticks=(0, 8, 16, 24, 31))
+        ax.set_xticks(np.arange(0, 361, 90), ["right", "behind", "left", "ahead", "right"])
+        ax.grid(False)
+    maps[0].set_ylabel("laser, highest on top")
+    above.colorbar(image, ax=maps, label="fraction of beams that return", pad=0.01)
+    axes = below.subplots(1, 4)
+    for statistics in (statistics for statistics in found.values() if statistics["is_part"]):
+        _draw_sweep_curves(axes, statistics, {**STYLES[0], "linewidth": 0.6, "alpha": 0.7})
+    for (name, statistics), look in zip(whole.items(), STYLES, strict=False):
+        _draw_sweep_curves(axes, statistics, {**look, "linewidth": 1.3, "label": name})
+    below.legend(*axes[0].get_legend_handles_labels(), loc="outside upper left", ncols=2)
+    return figure
+
+
+def _draw_sweep_curves(axes: Sequence[Axes], statistics: dict, look: dict) -> None:
+    axes[0].plot(statistics["laser_counts"], np.arange(32), **look)
+    axes[0].set(xlabel="points per sweep", ylabel="laser, highest on top", xlim=(0, 1100), ylim=(31.5, -0.5))
+    labels = {"ranges": "range [m]", "heights": "height above radar [m]", "intensities": "intensity"}
+    for ax, (name, label) in zip(axes[1:], labels.items(), strict=True):
+        fractions, edges = statistics["histograms"][name], statistics["edges"][name]
+        ax.step(edges[:-1], fractions / np.diff(edges), where="post", **look)
+        ax.set(xlabel=label, yscale="log", ylabel="density" if name == "ranges" else "")
+    axes[1].set(xlim=(0, 100))
+    axes[3].set(xlim=(0, 110))
+
+
 def _draw_histogram(ax: Axes, statistics: dict, look: dict) -> None:
     fractions = statistics["histogram"]
     codes = np.flatnonzero(fractions > 0)

@@ -14,7 +14,9 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from rol.geometry import relative_pose, transform_points
-from rol.radar import MEASURED, ScanMotion, k_strongest_peaks, polar_to_cartesian
+from rol.lidar import crop_range, remove_ground
+from rol.radar import MEASURED, RangeCalibration, ScanMotion, k_strongest_peaks, polar_to_cartesian
+from rol.similarity import fraction_within, nn_distances
 from rol_sim.sensors.radar import beam_azimuths
 
 BRIGHTNESS_CODES = (40, 60, 80, 100, 120)
@@ -370,6 +372,38 @@ def scan_statistics(codes: np.ndarray) -> dict:
     }
 
 
+def summarize_scans(statistics: dict, reference: dict) -> dict[str, float]:
+    """Select the statistics of scans that are one number each, for a table.
+
+    Parameters
+    ----------
+    statistics, reference : dict
+        From `scan_statistics`; the codes' histogram is compared with that of the reference.
+
+    Returns
+    -------
+    rows : dict
+        What it is -> number.
+    """
+    floors, near, noise = statistics["floors"], statistics["near_field"], statistics["range_correlation"]
+    return {
+        "Hellinger distance of the codes to real": hellinger_distance(
+            statistics["histogram"], reference["histogram"]
+        ),
+        **{f"fraction of codes >= {code}": fraction for code, fraction in statistics["fractions"].items()},
+        **{
+            f"fraction of code 0 in quiet bins at {r:g} m": fraction
+            for r, fraction in statistics["zero_fractions"].items()
+        },
+        **{f"noise correlation at {lag} bins": noise[lag - 1] for lag in (1, 3, 5, 7)},
+        "correlation of neighbouring azimuths": statistics["azimuth_correlation"],
+        **{f"mean code of the leakage at {r:g} m": code for r, code in near.items()},
+        **{f"far floor of rows that peak at {name}": code for name, code in floors.items()},
+        "greatest code": statistics["greatest"],
+        "pixels with a code that cannot be": statistics["forbidden"],
+    }
+
+
 def _fractions_by_range(
     codes: np.ndarray, code: int, edges_m: tuple[float, ...] = (2.5, 5, 10, 20, 30, 50, 80, 110, 165)
 ) -> dict:
@@ -439,6 +473,40 @@ def map_fractions(
         gaps = tree.query(transform_points(pose, peaks))[0]
         fractions.append([float(np.mean(gaps < limit)) if len(gaps) else float("nan") for limit in within_m])
     return np.array(fractions)
+
+
+def relate_to_lidar(
+    codes: np.ndarray, azimuths: np.ndarray, points: np.ndarray, calibration: RangeCalibration
+) -> dict[str, float]:
+    """Compare the raw radar peaks and the lidar points of one moment, within 20 m of the car, in both directions.
+
+    Parameters
+    ----------
+    codes : array, shape (400, n)
+        Scan.
+    azimuths : array, shape (400,)
+        Azimuths of its rows [rad].
+    points : array, shape (m, 3) or more columns
+        Lidar points in the radar frame [m].
+    calibration : RangeCalibration
+        Range bins of the radar.
+
+    Returns
+    -------
+    relation : dict
+        "peaks" and "lidar points": their numbers; "peaks with a lidar point within ... m", "lidar points with a peak within
+        ... m": fractions [0..1].
+    """
+    peaks = k_strongest_peaks(codes, azimuths, 12, 70, range_limits_m=(2.5, 30.0), calibration=calibration)
+    points = crop_range(remove_ground(points), 30.0, 2.5)[:, :2]
+    echoes = nn_distances(crop_range(peaks, 20.0), points)
+    seen = nn_distances(crop_range(points, 20.0), peaks)
+    return {
+        "peaks": len(echoes),
+        "lidar points": len(seen),
+        **{f"peaks with a lidar point within {r:g} m": fraction_within(echoes, r) for r in (1.0, 2.0)},
+        **{f"lidar points with a peak within {r:g} m": fraction_within(seen, r) for r in (0.5, 1.0, 2.0)},
+    }
 
 
 def _rows(codes: np.ndarray) -> np.ndarray:

@@ -360,7 +360,7 @@ def to_room(points: np.ndarray, T_radar_lidar: np.ndarray, poses: np.ndarray) ->
 def test_sweep_reads_back_as_the_true_hits(sensor: str) -> None:
     """A car that drives and turns; the reader's points, each moved by its own pose, lie on the walls."""
     T_radar_lidar = np.linalg.inv(EXTRINSICS["radar"]) @ EXTRINSICS[sensor]
-    stamps, angles = schedule_firings(STAMP, np.random.default_rng(1), first_angle=1.0)
+    stamps, angles = schedule_firings(STAMP, np.random.default_rng(1), past_seam=0.05)
     t = (stamps - STAMP) * 1e-6
     poses = np.column_stack([2.0 + 9.0 * t, -1.0 + 3.0 * t, 0.4 + 1.5 * t])
     sweep = simulate_sweep(
@@ -402,18 +402,52 @@ def test_both_lidars_see_the_same_town(town: world.Town) -> None:
     assert np.median(distance) < 0.2
 
 
-def test_firings_follow_the_packets() -> None:
-    stamps, angles = schedule_firings(STAMP, np.random.default_rng(0))
-    assert len(stamps) == 1085 and stamps[0] == STAMP
-    assert 49_800 < stamps[-1] - STAMP < 50_100
+@pytest.mark.parametrize(("past_seam", "count"), [(0.0, 1092), (0.02, 1092), (0.05, 1080)])
+def test_firings_follow_the_packets(past_seam: float, count: int) -> None:
+    stamps, angles = schedule_firings(STAMP, np.random.default_rng(0), past_seam=past_seam)
+    assert len(stamps) == count and stamps[0] == STAMP  # whole packets, as in real sweeps
+    assert 49_600 < stamps[-1] - STAMP < 50_400
     assert angles.dtype == np.uint16 and angles.max() < 36_000
-    np.testing.assert_allclose(
-        np.diff(angles.astype(int)).mean(), 33.2, atol=0.1
-    )  # clockwise seen from above
-    for start in range(0, 1080, 12):  # between two packets times are interpolated
-        line = np.linspace(stamps[start], stamps[start + 12], 13) if start + 12 < 1085 else None
-        if line is not None:
-            assert np.abs(stamps[start : start + 13] - line).max() <= 1.0
+    assert angles[0] == round(18_000 + 100 * np.rad2deg(past_seam))
+    turned = np.cumsum(np.diff(angles.astype(int)) % 36_000)
+    np.testing.assert_allclose(np.diff(turned).mean(), 33.2, atol=0.1)  # clockwise seen from above
+    assert (
+        0 <= turned[-1] + 34 - (36_000 - 100 * np.rad2deg(past_seam)) < 400
+    )  # it ends where the next one begins
+    for start in range(0, count - 12, 12):  # between two packets times are interpolated
+        line = np.linspace(stamps[start], stamps[start + 12], 13)
+        assert np.abs(stamps[start : start + 13] - line).max() <= 1.0
+
+
+def test_the_own_car_hides_the_same_on_both_sides() -> None:
+    """The lowest laser sees the road beside the car only: on the left by the left lidar, on the right by the right one."""
+    angles = np.arange(0, 36_000, 100, dtype=np.uint16)
+    ones = np.ones((32, len(angles)))
+    full = lidar_sensor.Sweep(
+        ones.astype(np.uint8), ones.astype(np.uint16), angles, angles.astype(np.int64), ones.astype(np.uint8)
+    )
+    seen = {
+        sensor: lidar_sensor.hide_behind_car(full, sensor) for sensor in ("velodyne_left", "velodyne_right")
+    }
+    assert (seen["velodyne_left"].ranges[31, 160:250] > 0).all()  # 180 deg is the vehicle's left
+    assert (seen["velodyne_left"].ranges[31, 0:90] == 0).all() and (
+        seen["velodyne_left"].ranges[:, :40] == 0
+    ).all()
+    assert (seen["velodyne_right"].ranges[31, 0:20] > 0).all() and (
+        seen["velodyne_right"].ranges[31, 290:] > 0
+    ).all()
+    mirror = (540 - 1 - np.arange(360)) % 360
+    np.testing.assert_array_equal(seen["velodyne_right"].ranges, seen["velodyne_left"].ranges[:, mirror])
+    for sweep in seen.values():
+        for values, kind in (
+            (sweep.ranges, np.uint16),
+            (sweep.intensities, np.uint8),
+            (sweep.materials, np.uint8),
+        ):
+            np.testing.assert_array_equal(values > 0, sweep.ranges > 0)
+            assert values.dtype == kind
+    with pytest.raises(ValueError, match="expected one of velodyne_left, velodyne_right, got 'top'"):
+        lidar_sensor.hide_behind_car(full, "top")
 
 
 def test_what_a_lidar_loses() -> None:

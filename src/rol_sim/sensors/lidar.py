@@ -7,19 +7,27 @@ downward.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
 
 from rol.geometry import check_fields
-from rol.oxford import ELEVATIONS_DOWN, FIRE_HEIGHT, RANGE_UNIT
+from rol.oxford import ELEVATIONS_DOWN, FIRE_HEIGHT, LIDARS, RANGE_UNIT
 from rol_sim.world.mesh import Material
 from rol_sim.world.scene import Scene
 
 FIRING_US = 46.08  # time between two firings of the same laser
 FIRINGS_PER_PACKET = 12
 TURN_US = 50_000.0
+PACKET_RAD = 2.0 * np.pi * FIRINGS_PER_PACKET * FIRING_US / TURN_US  # turned during one packet
+SEAM_RAD = np.pi  # a sweep begins with the first packet past this angle, to the lidar's right
+# How many of the 32 lasers, from the top, see past the own car, per 10 deg of angle, left lidar; below is the roof,
+# at 0 to 40 deg stand the mast of the radar and the other lidar. Constants of Oxford's car, measured on 257 real sweeps.
+CLEAR_LASERS = np.array(
+    [0, 0, 0, 0, 18, 17, 17, 18, 19, 23, 27, 26, 25, 28, 31, 32, 32, 32]
+    + [32, 32, 32, 32, 32, 32, 32, 31, 27, 26, 26, 25, 22, 21, 21, 20, 19, 19]
+)
 
 # Material -> fraction of light sent back by a head-on surface, fraction of rays lost without a trace, softness [m].
 SURFACES = {
@@ -61,8 +69,8 @@ class LidarSettings:
         If a value is out of its range; the message names it.
     """
 
-    range_noise_m: float = 0.02
-    lost_fraction: float = 0.01
+    range_noise_m: float = 0.005
+    lost_fraction: float = 0.0
     max_range_m: float = 100.0
     reach_m: float = 75.0
 
@@ -103,9 +111,9 @@ def surface_table() -> np.ndarray:
 
 
 def schedule_firings(
-    start_us: int, rng: np.random.Generator, *, turn_us: float = TURN_US, first_angle: float = 0.0
+    start_us: int, rng: np.random.Generator, *, turn_us: float = TURN_US, past_seam: float = 0.0
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return times and angles of the firings of one turn.
+    """Return times and angles of the firings of one turn, in whole packets: 1080 or 1092 as in real sweeps.
 
     Parameters
     ----------
@@ -115,8 +123,8 @@ def schedule_firings(
         Draws the jitter of the packets' times.
     turn_us : float
         Duration of the turn [us].
-    first_angle : float
-        Angle of the first firing [rad].
+    past_seam : float
+        How far past `SEAM_RAD` the first packet begins [rad]. The sweep ends with the packet that reaches it again.
 
     Returns
     -------
@@ -125,12 +133,13 @@ def schedule_firings(
     angles : array, shape (n,), uint16
         Angle in hundredths of a degree, 0 .. 35999.
     """
-    n = int(turn_us / FIRING_US)
+    per_firing = 2.0 * np.pi * FIRING_US / turn_us
+    n = FIRINGS_PER_PACKET * int(np.ceil((2.0 * np.pi - past_seam) / (FIRINGS_PER_PACKET * per_firing)))
     firing = np.arange(n)
     packets = np.arange(0, n + FIRINGS_PER_PACKET, FIRINGS_PER_PACKET)
     jitter = np.append(0.0, rng.normal(0.0, 3.0, len(packets) - 1))
     stamps = start_us + np.rint(np.interp(firing, packets, packets * FIRING_US + jitter)).astype(np.int64)
-    angles = first_angle * 18_000.0 / np.pi + 36_000.0 * firing * FIRING_US / turn_us
+    angles = np.rad2deg(SEAM_RAD + past_seam + per_firing * firing) * 100.0
     return stamps, (np.rint(angles).astype(np.int64) % 36_000).astype(np.uint16)
 
 
@@ -220,7 +229,7 @@ def simulate_sweep(
     is_seen = (reflectivity * cosine > faintest * np.maximum(r, 1.0) ** 2) & ~is_lost
     r = r + settings.range_noise_m * draws[1] + np.abs(draws[2]) * softness
     is_seen &= (r > 0.9) & (r < settings.max_range_m)
-    shade = 100.0 * reflectivity * (0.5 + 0.5 * cosine) * np.exp(0.15 * draws[3])
+    shade = 100.0 * reflectivity * cosine * np.exp(0.3 * draws[3])
     seen = reached[is_seen]
     intensities, ranges, materials = (
         np.zeros(len(hits.t), dtype=kind) for kind in (np.uint8, np.uint16, np.uint8)
@@ -231,4 +240,37 @@ def simulate_sweep(
     shape = (len(ELEVATIONS_DOWN), len(angles))
     return Sweep(
         intensities.reshape(shape), ranges.reshape(shape), angles, stamps_us, materials.reshape(shape)
+    )
+
+
+def hide_behind_car(sweep: Sweep, sensor: str) -> Sweep:
+    """Remove the returns of the beams that end on the own car.
+
+    Parameters
+    ----------
+    sweep : Sweep
+        A turn as it would be without the car.
+    sensor : str
+        "velodyne_left" or "velodyne_right"; the right lidar's view is the mirror image of the left one's.
+
+    Returns
+    -------
+    sweep : Sweep
+        The turn with 0 in place of the returns below `CLEAR_LASERS`. Returns from the car itself are left out.
+
+    Raises
+    ------
+    ValueError
+        If there is no such lidar.
+    """
+    if sensor not in LIDARS:
+        raise ValueError(f"sensor: expected one of {', '.join(LIDARS)}, got {sensor!r}")
+    angles = sweep.angles.astype(np.int64)
+    mirrored = angles if sensor == LIDARS[0] else (53_999 - angles) % 36_000
+    is_clear = np.arange(len(ELEVATIONS_DOWN))[:, None] < CLEAR_LASERS[mirrored // 1000]
+    return replace(
+        sweep,
+        intensities=sweep.intensities * is_clear,
+        ranges=sweep.ranges * is_clear,
+        materials=sweep.materials * is_clear,
     )

@@ -24,7 +24,7 @@ from rol_data import rall
 from rol_sim.drive.recorded_poses import interpolate_trajectory, park_vehicles, plan_encounters
 from rol_sim.drive.town_loop import Trajectory, build_route, plan_trajectory
 from rol_sim.drive.traffic import Traffic, plan_traffic
-from rol_sim.sensors.lidar import Sweep, schedule_firings, simulate_sweep
+from rol_sim.sensors.lidar import PACKET_RAD, Sweep, hide_behind_car, schedule_firings, simulate_sweep
 from rol_sim.sensors.radar import COUNT_STEP, FIRST_COUNT, simulate_scan
 from rol_sim.session import logs
 from rol_sim.session.settings import (
@@ -384,11 +384,12 @@ def make_sweep(session: SimulatedSession, sensor: str, index: int) -> Sweep:
     """
     rng = session.generator(SWEEP + LIDARS.index(sensor), index)
     stamps, angles = schedule_firings(
-        int(session.sweeps_us[sensor][index]), rng, first_angle=float(rng.uniform(0.0, 0.006))
+        int(session.sweeps_us[sensor][index]), rng, past_seam=float(rng.uniform(0.0, PACKET_RAD))
     )
     poses = session.trajectory.pose(stamps)
     height = session.settings.radar_height_m + session.ground(poses[:1, :2])[0]
     T_radar_lidar = np.linalg.inv(EXTRINSICS["radar"]) @ EXTRINSICS[sensor]
     settings, _ = sensor_settings(session.settings)
     scene = session.scene_at(float(stamps[len(stamps) // 2]), settings.max_range_m + 10.0)
-    return simulate_sweep(scene, (stamps, angles), T_radar_lidar, poses, float(height), rng, settings)
+    sweep = simulate_sweep(scene, (stamps, angles), T_radar_lidar, poses, float(height), rng, settings)
+    return hide_behind_car(sweep, sensor)

@@ -37,7 +37,7 @@ from rol_sim.session.simulation import (
 )
 
 SCAN_BYTES, SWEEP_BYTES = 470_000, 65_000  # what a file takes on the mean
-FORMAT = 4  # raise it when the same settings give other files
+FORMAT = 5  # raise it when the same settings give other files
 _MADE = (
     "session.json",
     "truth.tum",
