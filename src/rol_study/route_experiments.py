@@ -17,6 +17,7 @@ import numpy as np
 from rol.evaluation import FailureMonitor, FailureRule
 from rol.geometry import compose, relative_pose
 from rol.mcl import MapGrid, MclSettings, ParticleFilter, localize
+from rol.radar import ScanMotion, compensate_points
 from rol_beyond.motion import MotionModel, gate_odometry
 from rol_beyond.recovery import (
     RecoveringFilter,
@@ -43,6 +44,7 @@ from rol_study.sampled_points import (
     solve_mixture,
 )
 
+UNCHANGED = MotionModel.matrix  # increments as they are
 CELL_M = 0.25  # of the filters' grids: the pixel of the real map
 
 
@@ -60,6 +62,9 @@ class RouteExperiment:
         Properties of the sampled points.
     visible : VisiblePoints
         Points of the map visible from each true pose.
+    mixture_poses, calibration_poses : array, shape (k, 3)
+        Ground-truth poses of the whole session, for `parts`, and of the other one, for `reference_contrast`
+        [m, m, rad].
     parts : array, shape (3,)
         Parts of near points, points beside and false ones that have the front end's precision over the whole session.
     motion : MotionModel
@@ -77,6 +82,8 @@ class RouteExperiment:
     map_points: np.ndarray
     front_end: FrontEnd
     visible: VisiblePoints
+    mixture_poses: np.ndarray
+    calibration_poses: np.ndarray
     parts: np.ndarray
     motion: MotionModel
     calibration_session: str
@@ -121,16 +128,46 @@ def prepare_experiment(
     """
     map_points = load_map_points(Path(real_root, MAP_PATH), MAP_SHAPE)
     session = load_session(real_root, number, map_points)
-    sample = session.truth[np.linspace(0, len(session.truth) - 1, 200).astype(int)]
-    parts = _find_parts(map_points, sample, front_end)
+    mixture_poses = _choose(session.truth, 200)
     if max_scans:
-        session = RouteSession(number, session.truth[:max_scans], session.increments[: max_scans - 1])
+        cut = session.truth[:max_scans], session.increments[: max_scans - 1]
+        session = replace(session, truth=cut[0], increments=cut[1])
     motion, other, poses = calibrate_on_another(real_root, number, map_points)
-    poses = poses[np.linspace(0, len(poses) - 1, min(n_reference, len(poses))).astype(int)]
     grid = (settings or settings_for("robust")).measurement.build_grid(map_points)
-    reference = _measure_reference(map_points, poses, front_end, grid)
     visible = find_visible_points(map_points, session.truth)
-    return RouteExperiment(session, map_points, front_end, visible, parts, motion, other, reference, grid)
+    own = session, map_points, front_end, visible, mixture_poses, _choose(poses, n_reference)
+    return change_front_end(RouteExperiment(*own, np.ones(3) / 3, motion, other, 0.0, grid), front_end)
+
+
+def _choose(poses: np.ndarray, n: int) -> np.ndarray:
+    """Choose n poses evenly, or all if there are fewer."""
+    return poses[np.linspace(0, len(poses) - 1, min(n, len(poses))).astype(int)]
+
+
+def change_front_end(experiment: RouteExperiment, front_end: FrontEnd) -> RouteExperiment:
+    """Give the same experiment with the points of another front end.
+
+    Parameters
+    ----------
+    experiment : RouteExperiment
+        Session, map and calibration.
+    front_end : FrontEnd
+        Properties of the sampled points.
+
+    Returns
+    -------
+    experiment : RouteExperiment
+        With the parts and the reference contrast that belong to the front end.
+
+    Raises
+    ------
+    rol_study.sampled_points.SampledPointsError
+        If no mixture of points has the front end's fractions on this map.
+    """
+    e = experiment
+    parts = _find_parts(e.map_points, e.mixture_poses, front_end)
+    reference = _measure_reference(e.map_points, e.calibration_poses, front_end, e.grid)
+    return replace(e, front_end=front_end, parts=parts, reference_contrast=reference)
 
 
 def _measure_reference(
@@ -607,3 +644,49 @@ def add_outliers(session: RouteSession, fraction: float, rng: np.random.Generato
     turns = np.deg2rad(rng.uniform(-5.0, 5.0, n))
     increments[chosen] += np.column_stack([lengths * np.cos(angles), lengths * np.sin(angles), turns])
     return replace(session, increments=increments)
+
+
+def replace_odometry(experiment: RouteExperiment, odometry: str) -> RouteExperiment:
+    """Give the same experiment with another odometry.
+
+    Parameters
+    ----------
+    experiment : RouteExperiment
+        Session, map and calibration.
+    odometry : str
+        "true": the increments of the ground truth, with the noise that was calibrated for the authors' odometry.
+
+    Returns
+    -------
+    experiment : RouteExperiment
+
+    Raises
+    ------
+    ValueError
+        If the odometry is unknown.
+    """
+    session = experiment.session
+    if odometry != "true":
+        raise ValueError(f"odometry: {odometry!r} is unknown; expected 'true'")
+    motion = replace(experiment.motion, matrix=UNCHANGED, stationary_matrix=UNCHANGED)
+    return replace(experiment, session=replace(session, increments=session.true_increments), motion=motion)
+
+
+def skew_by_motion(clouds: Iterable[np.ndarray], true_increments: np.ndarray) -> list[np.ndarray]:
+    """Distort the points of each scan as the motion during the turn and the Doppler shift do without compensation.
+
+    Parameters
+    ----------
+    clouds : iterable of array, shape (m, 2)
+        Points of each of n scans in the radar frame at mid-scan [m].
+    true_increments : array, shape (n - 1, 3)
+        Motion from each scan to the next [m, m, rad].
+
+    Returns
+    -------
+    clouds : list of array, shape (m, 2)
+        `rol.radar.compensate_points` with the opposite motion, whose inverse it is to first order [m].
+    """
+    twists = true_increments[np.minimum(np.arange(len(true_increments) + 1), len(true_increments) - 1)]
+    twists = twists / (SCAN_US * 1e-6)
+    return [compensate_points(cloud, ScanMotion(-twist)) for cloud, twist in zip(clouds, twists, strict=True)]
