@@ -44,7 +44,7 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> list[SimpleNamespace]:
                 changes=changes,
                 seed=seed,
                 clouds=np.array(clouds),
-            )  # fmt: skip
+            )
         )
         spread = np.full((N, 3, 3), np.nan) if method == "registration" else np.tile(np.eye(3), (N, 1, 1))
         return FilterRun(truth, spread, [], np.zeros(N, dtype=bool), np.ones(N), np.full(N, 100), np.ones(N))
