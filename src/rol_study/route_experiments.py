@@ -27,7 +27,7 @@ from rol_beyond.recovery import (
 )
 from rol_beyond.robust import settings_for
 from rol_beyond.scan_matching import ScanToMapSettings, scan_to_map_icp
-from rol_data.rall import MAP_PATH, MAP_SHAPE, load_map_points
+from rol_data.rall import load_map
 from rol_study.oxford_route import (
     SCAN_US,
     RouteSession,
@@ -44,7 +44,7 @@ from rol_study.sampled_points import (
     solve_mixture,
 )
 
-UNCHANGED = MotionModel.matrix  # increments as they are
+N_REFERENCE = 300  # scans of the other session on which the reference contrast is measured
 CELL_M = 0.25  # of the filters' grids: the pixel of the real map
 
 
@@ -96,8 +96,9 @@ def prepare_experiment(
     number: str,
     front_end: FrontEnd,
     *,
+    place: str = "oxford",
+    odometry: str = "rall",
     max_scans: int = 0,
-    n_reference: int = 300,
     settings: MclSettings | None = None,
 ) -> RouteExperiment:
     """Load a session and the map, find the visible points of all poses, and calibrate on another session.
@@ -110,10 +111,10 @@ def prepare_experiment(
         Session, such as "02".
     front_end : FrontEnd
         Properties of the sampled points.
+    place, odometry : str
+        See `rol_study.oxford_route.load_session`; the motion model is calibrated on the same odometry.
     max_scans : int
         Use only the first scans, 0 for all.
-    n_reference : int
-        Scans of the other session on which the reference contrast is measured.
     settings : MclSettings, optional
         Of the filter that the reference contrast is for; those of the method `robust` if not given.
 
@@ -126,16 +127,15 @@ def prepare_experiment(
     rol_data.rall.RallError, rol_study.oxford_route.RouteError
         If the files are missing or faulty.
     """
-    map_points = load_map_points(Path(real_root, MAP_PATH), MAP_SHAPE)
-    session = load_session(real_root, number, map_points)
+    map_points = load_map(real_root, place)
+    session = load_session(real_root, number, map_points, place, odometry)
     mixture_poses = _choose(session.truth, 200)
     if max_scans:
-        cut = session.truth[:max_scans], session.increments[: max_scans - 1]
-        session = replace(session, truth=cut[0], increments=cut[1])
-    motion, other, poses = calibrate_on_another(real_root, number, map_points)
+        session = session.part(0, max_scans)
+    motion, other, poses = calibrate_on_another(real_root, number, map_points, place, odometry)
     grid = (settings or settings_for("robust")).measurement.build_grid(map_points)
     visible = find_visible_points(map_points, session.truth)
-    own = session, map_points, front_end, visible, mixture_poses, _choose(poses, n_reference)
+    own = session, map_points, front_end, visible, mixture_poses, _choose(poses, N_REFERENCE)
     return change_front_end(RouteExperiment(*own, np.ones(3) / 3, motion, other, 0.0, grid), front_end)
 
 
@@ -644,32 +644,6 @@ def add_outliers(session: RouteSession, fraction: float, rng: np.random.Generato
     turns = np.deg2rad(rng.uniform(-5.0, 5.0, n))
     increments[chosen] += np.column_stack([lengths * np.cos(angles), lengths * np.sin(angles), turns])
     return replace(session, increments=increments)
-
-
-def replace_odometry(experiment: RouteExperiment, odometry: str) -> RouteExperiment:
-    """Give the same experiment with another odometry.
-
-    Parameters
-    ----------
-    experiment : RouteExperiment
-        Session, map and calibration.
-    odometry : str
-        "true": the increments of the ground truth, with the noise that was calibrated for the authors' odometry.
-
-    Returns
-    -------
-    experiment : RouteExperiment
-
-    Raises
-    ------
-    ValueError
-        If the odometry is unknown.
-    """
-    session = experiment.session
-    if odometry != "true":
-        raise ValueError(f"odometry: {odometry!r} is unknown; expected 'true'")
-    motion = replace(experiment.motion, matrix=UNCHANGED, stationary_matrix=UNCHANGED)
-    return replace(experiment, session=replace(session, increments=session.true_increments), motion=motion)
 
 
 def skew_by_motion(clouds: Iterable[np.ndarray], true_increments: np.ndarray) -> list[np.ndarray]:

@@ -15,7 +15,7 @@ import numpy as np
 import pandas as pd
 import torch
 
-from rol.evaluation import METRICS, pose_errors, summarize
+from rol.evaluation import METRICS, pose_errors, rmse, summarize
 from rol.files import write_text
 from rol.mcl import MclSettings, Measurement
 from rol.pix2pix import load_network
@@ -24,8 +24,8 @@ from rol_beyond.consistency import consistency
 from rol_beyond.motion import MotionModel
 from rol_beyond.recovery import DetectionSettings, RecoverySettings
 from rol_beyond.robust import settings_for
-from rol_data.rall import POSES_PATH, load_poses
-from rol_study.oxford_route import RouteSession, list_sessions
+from rol_data.rall import PLACES, POSES_PATH, load_poses
+from rol_study.oxford_route import list_sessions
 from rol_study.rendered_points import build_segment, render_points
 from rol_study.route_experiments import (
     FilterRun,
@@ -35,14 +35,13 @@ from rol_study.route_experiments import (
     kidnap,
     localize_globally,
     prepare_experiment,
-    replace_odometry,
     run_method,
     sample_session,
     skew_by_motion,
 )
 from rol_study.sampled_points import FrontEnd, fraction_within_2m
 
-PAPER_SESSIONS = ("02", "07", "08", "10")  # Seq01 to Seq04 of the paper; session 01 made the map
+PAPER_SESSIONS = PLACES["oxford"].main_sessions  # Seq01 to Seq04 of the paper; session 01 made the map
 SHORT = 3000  # scans of the runs that compare settings
 QUALITIES = (0.44, 0.47, 0.50, 0.35, 0.60, 0.30, 0.80)  # within 1 m; 0.40 is the table "seeds"
 COMPARED = (0.40, 0.47)  # qualities at which settings and causes are compared
@@ -66,8 +65,9 @@ CAUSES = {
     "motion not compensated": ({}, {}, False),
     "flat weights, motion not compensated": (FLAT, {}, False),
 }
-ODOMETRIES = ("true", "cfear-3")
+COMPARED_ODOMETRIES = ("true", "cfear")
 CLASSES = ("within_1m_2deg", "within_2m_5deg", "within_5m_10deg")
+TEXT = dict.fromkeys(("job", "session", "odometry"), str)  # pandas reads "true" as a truth value
 RUN_COLUMNS = ["fraction_1m", "odometry", *METRICS]
 INGREDIENTS = {
     "all of robust": {},
@@ -90,22 +90,23 @@ TUNED = {"both": NARROW | QUIET, "d_th of 0.25 m": NARROW, "a fifth of the noise
 
 @lru_cache(maxsize=1)
 def session_of(
-    real_root: str, number: str, max_scans: int = 0, settings: MclSettings | None = None
+    real_root: str,
+    number: str,
+    max_scans: int = 0,
+    settings: MclSettings | None = None,
+    odometry: str = "rall",
 ) -> RouteExperiment:
     """Prepare the experiment once per worker and session, with the paper's front end."""
-    return prepare_experiment(real_root, number, FrontEnd(), max_scans=max_scans, settings=settings)
+    how = {"max_scans": max_scans, "settings": settings, "odometry": odometry}
+    return prepare_experiment(real_root, number, FrontEnd(), **how)
 
 
 @lru_cache(maxsize=1)
 def experiment_of(
-    real_root: str,
-    number: str,
-    front_end: FrontEnd | None = None,
-    max_scans: int = 0,
-    settings: MclSettings | None = None,
+    real_root: str, number: str, front_end: FrontEnd | None = None, max_scans: int = 0, **how: object
 ) -> RouteExperiment:
     """Prepare the experiment once per worker, session and front end."""
-    experiment = session_of(real_root, number, max_scans, settings)
+    experiment = session_of(real_root, number, max_scans, **how)
     return experiment if front_end is None else change_front_end(experiment, front_end)
 
 
@@ -120,7 +121,11 @@ def row_of(experiment: RouteExperiment, run: FilterRun, method: str, seed: int) 
     about = {"method": method, "session": experiment.session.number, "seed": seed}
     update_ms = float(np.median(run.update_ms))
     row = summarize(run.poses, truth, failures=len(run.failures), update_ms_median=update_ms, **about)
+    is_faulty = experiment.session.is_faulty
+    is_sound = np.ones(len(truth), dtype=bool) if is_faulty is None else ~is_faulty
     return row | {
+        "n_faulty": int((~is_sound).sum()),
+        "rmse_sound_m": rmse(errors.position_m[is_sound]),
         "median_m": float(np.median(errors.position_m)),
         "median_yaw_deg": float(np.rad2deg(np.median(np.abs(errors.yaw_rad)))),
         "largest_m": float(errors.position_m.max()),
@@ -170,8 +175,7 @@ def measure_quality(real_root: str, number: str, fraction_1m: float, seed: int) 
 
 def measure_odometry(real_root: str, number: str, odometry: str, fraction_1m: float, seed: int) -> list[dict]:
     """Run both methods over a whole session with another odometry, each calibrated on it."""
-    experiment = experiment_of(real_root, number, front_end_of(fraction_1m))
-    experiment = replace_odometry(experiment, odometry)
+    experiment = experiment_of(real_root, number, front_end_of(fraction_1m), odometry=odometry)
     clouds, about = sample_session(experiment, seed), {"odometry": odometry, "fraction_1m": fraction_1m}
     return [
         about | row_of(experiment, run_method(experiment, method, clouds, seed), method, seed)
@@ -256,11 +260,7 @@ def measure_rendered(
     experiment = experiment_of(real_root, number, FrontEnd(0.80, 0.88))
     simulated = build_segment(real_root, number, first, n_scans, seed)
     clouds = list(render_points(simulated, load_network(weights)))
-    truth, increments = (
-        experiment.session.truth[first : first + n_scans],
-        experiment.session.increments[first : first + n_scans - 1],
-    )
-    part = replace(experiment, session=RouteSession(number, truth, increments))
+    part = replace(experiment, session=experiment.session.part(first, first + n_scans))
     return [
         row_of(part, run_method(part, method, clouds, seed), method, seed) for method in ("paper", "robust")
     ]
@@ -334,7 +334,12 @@ def list_tuned(numbers: list[str]) -> list[tuple]:
 
 def list_odometry(numbers: list[str]) -> list[tuple]:
     """List the jobs with another odometry; CFEAR's is published for sessions 01 and 02."""
-    wanted = [(number, name) for number in numbers for name in ODOMETRIES if number == "02" or name == "true"]
+    wanted = [
+        (number, name)
+        for number in numbers
+        for name in COMPARED_ODOMETRIES
+        if number == "02" or name == "true"
+    ]
     return [(*key, quality, seed) for quality in (0.40, 0.50) for seed in (1, 2, 3) for key in wanted]
 
 
@@ -374,9 +379,7 @@ def run_table(
     ValueError
         If the table holds jobs that are not listed, such as those of another set of sessions; nothing is dropped.
     """
-    table = (
-        pd.read_csv(path, dtype={"session": str, "job": str}) if path.is_file() else pd.DataFrame({"job": []})
-    )
+    table = pd.read_csv(path, dtype=TEXT) if path.is_file() else pd.DataFrame({"job": []})
     wanted = [" ".join(map(str, key)) for key in jobs]
     if unlisted := sorted(set(table.job) - set(wanted)):
         raise ValueError(
@@ -411,7 +414,7 @@ def load_table(folder: Path | str, what: str) -> pd.DataFrame:
         One row per run; without rows and columns where the table is missing.
     """
     path = Path(folder, f"route_{what}.csv")
-    return pd.read_csv(path, dtype={"session": str, "job": str}) if path.is_file() else pd.DataFrame()
+    return pd.read_csv(path, dtype=TEXT) if path.is_file() else pd.DataFrame()
 
 
 def load_runs(folder: Path | str) -> pd.DataFrame:
@@ -425,14 +428,14 @@ def load_runs(folder: Path | str) -> pd.DataFrame:
     Returns
     -------
     runs : pandas.DataFrame
-        One row per run: the columns of `row_of`, ``fraction_1m`` of the points, and ``odometry``, which is "published"
+        One row per run: the columns of `row_of`, ``fraction_1m`` of the points, and ``odometry``, which is "rall"
         for the authors' own.
     """
     own = {"seeds": {"fraction_1m": 0.40}, "quality": {}, "odometry": {}}
     tables = [load_table(folder, what).assign(**about) for what, about in own.items()]
     runs = pd.concat([table for table in tables if len(table)] or [pd.DataFrame(columns=RUN_COLUMNS)])
     runs = runs.reindex(columns=[*RUN_COLUMNS, *runs.columns.difference(RUN_COLUMNS, sort=False)])
-    return runs.assign(odometry=runs.odometry.fillna("published")).drop(columns="job", errors="ignore")
+    return runs.assign(odometry=runs.odometry.fillna("rall")).drop(columns="job", errors="ignore")
 
 
 def summarize_runs(runs: pd.DataFrame, by: list[str]) -> pd.DataFrame:

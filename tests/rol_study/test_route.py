@@ -33,7 +33,6 @@ from rol_study.route_experiments import (
     kidnap,
     localize_globally,
     prepare_experiment,
-    replace_odometry,
     run_method,
     run_scan_to_map,
     sample_session,
@@ -201,18 +200,6 @@ def test_a_start_at_no_scan_of_the_session_is_refused(street: tuple, begin: Call
     )
     with pytest.raises(ValueError, match=f"first: {first} is no scan of session .*, which has 40"):
         begin(experiment, first, 1)
-
-
-def test_true_increments_take_the_place_of_the_odometry(street: tuple) -> None:
-    route, posts, _ = street
-    experiment = RouteExperiment(
-        route, posts, FrontEnd(), None, route.truth, route.truth, None, published_motion(), "", 0.2, None
-    )
-    changed = replace_odometry(experiment, "true")
-    np.testing.assert_array_equal(changed.session.increments, route.true_increments)
-    np.testing.assert_allclose(changed.motion.mean(route.true_increments), route.true_increments, atol=1e-12)
-    with pytest.raises(ValueError, match="odometry: 'wheels' is unknown"):
-        replace_odometry(experiment, "wheels")
 
 
 def test_points_are_skewed_by_the_motion_of_their_own_scan(street: tuple) -> None:

@@ -49,8 +49,9 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> list[SimpleNamespace]:
         spread = np.full((N, 3, 3), np.nan) if method == "registration" else np.tile(np.eye(3), (N, 1, 1))
         return FilterRun(truth, spread, [], np.zeros(N, dtype=bool), np.ones(N), np.full(N, 100), np.ones(N))
 
-    def prepare(real_root, number, front_end=None, max_scans=0, settings=None) -> RouteExperiment:
-        return replace(experiment, front_end=front_end or route_tables.FrontEnd())
+    def prepare(real_root, number, front_end=None, max_scans=0, settings=None, odometry="rall"):
+        session = replace(experiment.session, odometry=odometry)
+        return replace(experiment, front_end=front_end or route_tables.FrontEnd(), session=session)
 
     monkeypatch.setattr(route_tables, "experiment_of", prepare)
     monkeypatch.setattr(route_tables, "sample_session", lambda experiment, seed: [np.ones((1, 2))] * N)
@@ -118,8 +119,18 @@ def test_better_points_and_another_odometry_are_run_with_both_methods(asked: lis
     rows += route_tables.measure_odometry("", "07", "true", 0.5, 2)
     assert [row["method"] for row in rows] == ["paper", "robust"] * 2 and rows[-1]["odometry"] == "true"
     assert {made.experiment.front_end.fraction_2m for made in asked} == {0.67}
-    assert asked[-1].experiment.motion.matrix == MotionModel.matrix != published_motion().matrix
-    assert asked[-1].experiment.motion.sigma_base == published_motion().sigma_base
+    assert [made.experiment.session.odometry for made in asked] == ["rall"] * 2 + ["true"] * 2
+
+
+def test_a_row_is_also_judged_without_scans_of_faulty_ground_truth(asked: list) -> None:
+    route_tables.measure_registration("", "07", 1)
+    experiment, run = asked[0].experiment, route_tables.run_method(asked[0].experiment, "paper", [], 1)
+    shifted = replace(run, poses=run.poses + np.where(np.arange(N) < 3, 4.0, 0.0)[:, None] * (1.0, 0.0, 0.0))
+    row = route_tables.row_of(experiment, shifted, "paper", 1)
+    assert (row["n_faulty"], row["rmse_sound_m"]) == (0, row["rmse_m"]) and row["rmse_m"] > 1.0
+    marked = replace(experiment, session=replace(experiment.session, is_faulty=np.arange(N) < 3))
+    row = route_tables.row_of(marked, shifted, "paper", 1)
+    assert (row["n_faulty"], row["rmse_sound_m"]) == (3, 0.0) and row["rmse_m"] > 1.0
 
 
 def test_settings_are_swept_past_the_best_of_the_first_sweep(asked: list) -> None:
@@ -204,9 +215,9 @@ def test_stored_runs_carry_their_quality_and_odometry(tmp_path: Path) -> None:
         pd.DataFrame([run | change for change in more]).to_csv(tmp_path / f"route_{what}.csv", index=False)
     runs = route_tables.load_runs(tmp_path)
     assert runs[["session", "fraction_1m", "odometry"]].to_numpy().tolist() == [
-        ["02", 0.4, "published"], ["10", 0.4, "published"], ["02", 0.5, "published"], ["02", 0.4, "true"]
+        ["02", 0.4, "rall"], ["10", 0.4, "rall"], ["02", 0.5, "rall"], ["02", 0.4, "true"]
     ]  # fmt: skip
     groups = route_tables.summarize_runs(runs, ["fraction_1m", "odometry"])
-    row = groups.loc[(0.4, "published")]
+    row = groups.loc[(0.4, "rall")]
     assert (row.n_runs, row.n_sessions, row.n_seeds) == (2, 2, 2) and row.failures == 1.5
     assert (row.rmse_m, row.min_m, row.max_m, row.within_1m_2deg) == (2.0, 1.0, 3.0, 50.0)
