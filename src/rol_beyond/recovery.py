@@ -9,6 +9,11 @@ the estimate over several scans, none of which was used to find it, replaces the
 A wrong place may match for seconds, as streets repeat themselves, so no decision is based on one scan. A stationary vehicle
 observes the same false points again and again. So once an estimate is trusted, only scans taken while moving count against
 it.
+
+Off the map no point matches, and the odometry alone would move the estimate away without end. The estimate is held at the
+distance from the map's extent at which the radar still sees the map, and the filter reports that it is lost. The particles go
+on by odometry, so a vehicle that leaves the map and returns needs no search. The paper's filter has no such limit: when it
+is lost, its evaluation counts a failure and resets it (`rol.evaluation.FailureMonitor`).
 """
 
 from __future__ import annotations
@@ -190,6 +195,8 @@ class RecoverySettings:
     stationary_weight : float
         Factor on the exponent of Eq. 8 for a stationary vehicle, whose scans show the same false points again and again
         and are not independent.
+    max_outside_m : float
+        Largest distance of the estimate from the map's extent, in x and in y [m]. 64: the range of the radar.
     detection, relocalization, confirmation
         See their classes.
 
@@ -202,6 +209,7 @@ class RecoverySettings:
     reference_contrast: float
     stationary_m: float = 0.05
     stationary_weight: float = 0.25
+    max_outside_m: float = 64.0
     detection: DetectionSettings = field(default_factory=DetectionSettings)
     relocalization: RelocalizationSettings = field(default_factory=RelocalizationSettings)
     confirmation: ConfirmationSettings = field(default_factory=ConfirmationSettings)
@@ -209,7 +217,7 @@ class RecoverySettings:
     def __post_init__(self) -> None:
         allowed = {
             "(0, inf)": "reference_contrast",
-            "[0, inf]": "stationary_m",
+            "[0, inf]": "stationary_m max_outside_m",
             "(0, 1]": "stationary_weight",
         }
         check_fields(self, allowed)
@@ -423,6 +431,8 @@ class RecoveringFilter:
         self.map_points, self.settings, self.recovery, self.rng = map_points, settings, recovery, rng
         self.grid = settings.measurement.build_grid(map_points) if grid is None else grid
         self.coarse_grid: MapGrid | None = None
+        low, high = map_points.min(axis=0), map_points.max(axis=0)
+        self.bounds = low - recovery.max_outside_m, high + recovery.max_outside_m
         exponent = recovery.stationary_weight * settings.measurement.exponent
         self.stationary = replace(settings, measurement=replace(settings.measurement, exponent=exponent))
         self.reset(start)
@@ -438,7 +448,7 @@ class RecoveringFilter:
         n_clouds = recovery.relocalization.n_clouds
         self.clouds, self.increments = deque(maxlen=n_clouds), deque(maxlen=n_clouds - 1)
         self.scores = deque(maxlen=max(recovery.detection.n_scans, recovery.confirmation.n_scans))
-        self.is_far, self.is_trusted, self.n_lost = False, False, 0
+        self.is_far, self.is_trusted, self.is_held, self.n_lost = False, False, False, 0
         # Scans since the last search; distances since the last search, the last scan that counted, a low score.
         self.since_search, self.searched_m, self.moved_m, self.high_score_m = 10**6, 1e9, 0.0, 0.0
 
@@ -458,7 +468,7 @@ class RecoveringFilter:
         """
         length = np.inf if increment is None else self._predict(increment)
         settings = self.settings if length > self.recovery.stationary_m else self.stationary
-        result = update(self.particles, self.weights, points, self.grid, settings, self.rng)
+        result = self._hold(update(self.particles, self.weights, points, self.grid, settings, self.rng))
         contrast = self._observe(result, points, settings.measurement.exponent)
         winner = self._find_winner()
         assessed = self._assess(result, contrast, winner)
@@ -483,6 +493,12 @@ class RecoveringFilter:
         self.searched_m += length
         self.hypotheses = self.hypotheses.predict(increment, motion, self.rng)
         return length
+
+    def _hold(self, result: MclUpdate) -> MclUpdate:
+        """Move an estimate far outside the map to the nearest position within the bounds."""
+        position = np.clip(result.pose[:2], *self.bounds)
+        self.is_held = not np.array_equal(position, result.pose[:2])
+        return replace(result, pose=np.append(position, result.pose[2])) if self.is_held else result
 
     def _observe(self, result: MclUpdate, points: np.ndarray, exponent: float) -> float:
         """Record the scan and the score contrasts of the estimate and of the hypotheses."""
@@ -522,7 +538,7 @@ class RecoveringFilter:
             filter=result,
             score_contrast=contrast,
             normalized_score=self.normalized_score,
-            is_lost=self.is_far or is_low or self._find_leader() is not None,
+            is_lost=self.is_far or self.is_held or is_low or self._find_leader() is not None,
             n_hypotheses=len(self.hypotheses),
             n_particles=len(result.particles) + self.hypotheses.weights.size,
             was_replaced=winner is not None,

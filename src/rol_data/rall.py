@@ -1,8 +1,9 @@
-"""Read the lidar map, ground truth and radar odometry of the paper's sessions, and single scans.
+"""Read lidar maps, ground truth and radar odometry of Oxford and MulRan sessions, and single scans.
 
-The paper's first author published them with a later work (Yin et al., "RaLL", T-ITS 2021). The files lie in a folder
-that is called `real_root`, in the layout of the public repositories, see `data/README.md`. All poses are (x, y, yaw)
-in the frame of the map [m, m, rad], y left, yaw counter-clockwise.
+The paper's first author published them with a later work (Yin et al., "RaLL", T-ITS 2021), of the paper's own sessions
+and of three places of MulRan (Kim et al., ICRA 2020), see `PLACES`. The files lie in a folder that is called
+`real_root`, in the layout of the public repositories, see `data/README.md`. All poses are (x, y, yaw) in the frame of
+the map [m, m, rad], y left, yaw counter-clockwise.
 """
 
 from __future__ import annotations
@@ -35,6 +36,65 @@ class RallError(ValueError):
 
 
 @dataclass(frozen=True)
+class Place:
+    """Files of one place: a lidar map, and sessions with ground truth and odometry.
+
+    Attributes
+    ----------
+    map_path : Path
+        Image of the map, 0.25 m per pixel.
+    map_shape : tuple of int
+        Its rows and columns.
+    map_corner : tuple of float
+        x at the upper edge of the first row, y at the left edge of the first column [m].
+    poses, odometry : str
+        Paths of a session's files, with its number for ``{}``.
+    main_sessions : tuple of str
+        Sessions that stand for the place when none is named; empty: all but the mapping session.
+    mapping_session : str
+        Session that the map was made from: its first pose is the origin of the map.
+    """
+
+    map_path: Path
+    map_shape: tuple[int, int]
+    map_corner: tuple[float, float]
+    poses: str
+    odometry: str
+    main_sessions: tuple[str, ...] = ()
+    mapping_session: str = "01"
+
+
+def _mulran(name: str, shape: tuple[int, int], corner: tuple[float, float]) -> Place:
+    """Describe a place of MulRan; the names of its odometry files begin with a capital letter, or are an acronym."""
+    title = name.upper() if name == "dcc" else name.capitalize()
+    path = Path(f"RaLL/data/maps/MulRan/png/laser_map_{name}.png")
+    poses = f"RaLL/data/gt_poses/MulRan/pose_{name}_{{}}.txt"
+    return Place(path, shape, corner, poses, f"RaLL/data/odom/MulRan/{title}{{}}_odom.txt")
+
+
+PLACES = {
+    "oxford": Place(
+        MAP_PATH,
+        MAP_SHAPE,
+        MAP_CORNER,
+        f"{POSES_PATH.as_posix()}/pose_xy_{{}}.txt",
+        f"{ODOMETRY_PATH.as_posix()}/seq{{}}_odom.txt",
+        main_sessions=("02", "07", "08", "10"),  # Seq01 to Seq04 of the paper
+    ),
+    "kaist": _mulran("kaist", (4000, 4000), (500.0, 200.0)),
+    "dcc": _mulran("dcc", (3200, 3275), (600.0, 200.0)),
+    "riverside": _mulran("riverside", (8800, 8800), (1800.0, 1100.0)),
+}
+
+
+def find_place(name: str) -> Place:
+    """Look up a place by its name, one of `PLACES`; raises `RallError` for another name."""
+    if name not in PLACES:
+        raise RallError(f"place: {name!r} is unknown; there are {', '.join(PLACES)}")
+    return PLACES[name]
+
+
+@dataclass(frozen=True)
 class RealScan:
     """A real radar scan whose pose on the real map is known.
 
@@ -60,28 +120,31 @@ class RealScan:
     twist: tuple[float, float, float] | None
 
 
-def find_real_root(given: str | Path = "") -> Path | None:
+def find_real_root(given: str | Path = "", place: str = "oxford") -> Path | None:
     """Find the folder of the real data.
 
     Parameters
     ----------
     given : path
         The folder; if empty, the environment variable ROL_REAL_ROOT, and `data/real` where that is not set.
+    place : str
+        Place whose map the folder must hold, one of `PLACES`.
 
     Returns
     -------
     root : Path or None
-        The folder, or None if it does not hold the lidar map.
+        The folder, or None if it does not hold the lidar map of the place.
 
     Raises
     ------
     RallError
-        If a folder is given and does not exist.
+        If a folder is given and does not exist, or the place is unknown.
     """
+    map_path = find_place(place).map_path
     if given and not Path(given).is_dir():
         raise RallError(f"real_root: there is no folder {given}")
     root = Path(given or os.environ.get("ROL_REAL_ROOT") or "data/real")
-    return root if (root / MAP_PATH).is_file() else None
+    return root if (root / map_path).is_file() else None
 
 
 def find_scan_poses(real_root: Path | str) -> Path:
@@ -90,8 +153,34 @@ def find_scan_poses(real_root: Path | str) -> Path:
     return own if own.is_file() else Path("data") / SCAN_POSES_PATH
 
 
-def load_map_points(path: Path | str, shape: tuple[int, int] | None = None) -> np.ndarray:
-    """Read the lidar map, an image of occupied cells.
+def load_map(real_root: Path | str, place: str = "oxford") -> np.ndarray:
+    """Read the lidar map of a place.
+
+    Parameters
+    ----------
+    real_root : path
+        Folder of the real data, see `find_real_root`.
+    place : str
+        One of `PLACES`.
+
+    Returns
+    -------
+    points : array, shape (n, 2)
+        See `load_map_points`.
+
+    Raises
+    ------
+    RallError
+        If the place is unknown, or the file is missing or faulty.
+    """
+    files = find_place(place)
+    return load_map_points(Path(real_root, files.map_path), files.map_shape, files.map_corner)
+
+
+def load_map_points(
+    path: Path | str, shape: tuple[int, int] | None = None, corner: tuple[float, float] = MAP_CORNER
+) -> np.ndarray:
+    """Read a lidar map, an image of occupied cells.
 
     Parameters
     ----------
@@ -99,6 +188,8 @@ def load_map_points(path: Path | str, shape: tuple[int, int] | None = None) -> n
         PNG of 0.25 m per pixel, zero for free, 255 for occupied; x points up and y to the left.
     shape : tuple of int, optional
         Rows and columns that the image must have, such as ``MAP_SHAPE``; any if not given.
+    corner : tuple of float
+        x at the upper edge of the first row, y at the left edge of the first column [m].
 
     Returns
     -------
@@ -124,7 +215,7 @@ def load_map_points(path: Path | str, shape: tuple[int, int] | None = None) -> n
     rows, columns = np.nonzero(image)
     if len(rows) == 0:
         raise RallError(f"{path}: the map holds no occupied cell")
-    x, y = MAP_CORNER
+    x, y = corner
     return np.column_stack([x - MAP_CELL * (rows + 0.5), y - MAP_CELL * (columns + 0.5)])
 
 
@@ -134,7 +225,7 @@ def load_poses(path: Path | str) -> np.ndarray:
     Parameters
     ----------
     path : path
-        `pose_xy_NN.txt`: x, y, yaw, one row per radar scan.
+        Such as `pose_xy_NN.txt`: x, y, yaw, one row per radar scan.
 
     Returns
     -------
@@ -155,12 +246,13 @@ def load_odometry(path: Path | str) -> np.ndarray:
     Parameters
     ----------
     path : path
-        `seqNN_odom.txt`: dx, dy, dyaw in the body frame; row i moves scan i to scan i + 1.
+        Such as `seqNN_odom.txt`: dx, dy, dyaw in the body frame; row i moves scan i to scan i + 1.
 
     Returns
     -------
     increments : array, shape (n, 3)
-        Odometry increments [m, m, rad]. Files 01 and 02 hold one row too many.
+        Odometry increments [m, m, rad]. Some files hold one row more or fewer than there are increments between the
+        poses, see `rol_study.oxford_route.match_increments`.
 
     Raises
     ------

@@ -34,6 +34,24 @@ class SampledPointsError(ValueError):
     """No points can be sampled from the map or the poses, or no mixture has the given fractions."""
 
 
+class DenseMapError(SampledPointsError):
+    """The map is so dense that points thrown at random lie near it more often than asked.
+
+    Attributes
+    ----------
+    chance_1m, chance_2m : float
+        Fractions of such points within 1 m and 2 m of the map.
+    """
+
+    def __init__(self, message: str, chance_1m: float, chance_2m: float) -> None:
+        super().__init__(message)
+        self.chance_1m, self.chance_2m = chance_1m, chance_2m
+
+    def __reduce__(self) -> tuple:
+        """Pickle with all arguments, as the error may be raised in another process."""
+        return type(self), (str(self), self.chance_1m, self.chance_2m)
+
+
 @dataclass(frozen=True)
 class FrontEnd:
     """Properties of a front end's points.
@@ -226,9 +244,18 @@ def solve_mixture(fractions: np.ndarray, fraction_1m: float, fraction_2m: float)
 
     Raises
     ------
+    DenseMapError
+        If false points alone have more within 1 m or 2 m.
     SampledPointsError
-        If no mixture has these fractions.
+        If no mixture has these fractions for another reason.
     """
+    chances = tuple(float(value) for value in np.asarray(fractions)[:, 2])
+    if fraction_1m < chances[0] or fraction_2m < chances[1]:
+        asked = f"{fraction_1m:.2f} within 1 m and {fraction_2m:.2f} within 2 m"
+        by_chance = f"{chances[0]:.2f} and {chances[1]:.2f}"
+        raise DenseMapError(
+            f"the map is too dense for points with {asked}: by chance {by_chance} are", *chances
+        )
     weights = np.linalg.solve(np.vstack([fractions, np.ones(3)]), [fraction_1m, fraction_2m, 1.0])
     if (weights < -1e-9).any():
         told = ", ".join(f"{kind} {weight:.2f}" for kind, weight in zip(KINDS, weights, strict=True))

@@ -76,6 +76,43 @@ def test_an_unknown_start_is_searched_globally(drive: tuple) -> None:
     assert off[-1] < 1.0 and not updates[-1].is_lost and updates[0].is_lost
 
 
+def drive_off(drive: tuple, max_outside_m: float) -> tuple[np.ndarray, np.ndarray]:
+    """Follow the drive, then odometry that leaves the map by 700 m and returns; estimates and reports of being lost."""
+    points, poses, increments, clouds = drive
+    steps = np.concatenate([np.tile((8.0, 0.0, 0.0), (100, 1)), np.tile((-8.0, 0.0, 0.0), (100, 1))])
+    empty = np.random.default_rng(2).uniform(-28.0, 28.0, (200, 100, 2))
+    reference = measure_reference_contrast(clouds[::5], poses[::5], FIELD.build_grid(points))
+    recovery = RecoverySettings(
+        reference, max_outside_m=max_outside_m, relocalization=RelocalizationSettings(far_reach_m=60.0)
+    )
+    robust_filter = RecoveringFilter(points, poses[0], SETTINGS, recovery, np.random.default_rng(1))
+    increments = np.concatenate([increments, steps])
+    updates = list(localize(robust_filter, increments, [*clouds, *empty]))
+    return np.array([u.pose for u in updates]), np.array([u.is_lost for u in updates])
+
+
+def test_an_estimate_off_the_map_is_held_and_reported(drive: tuple) -> None:
+    low, high = drive[0].min(axis=0), drive[0].max(axis=0)
+    free, _ = drive_off(drive, np.inf)
+    held, is_lost = drive_off(drive, 64.0)
+    np.testing.assert_array_equal(held[:70], free[:70])  # on the map nothing changes, to the last bit
+    assert (free[:, :2] > high + 500.0).any() and (held[:, :2] <= high + 64.0).all()
+    assert (held[:, :2] >= low - 64.0).all() and is_lost[-1]
+    at_border = (held[:, :2] == high + 64.0).any(axis=1)
+    assert at_border.sum() > 50 and is_lost[at_border].all()
+    assert not at_border[-10:].any() and np.hypot(*(held[-1] - drive[1][-1])[:2]) < 30.0  # it has returned
+
+
+def test_a_start_off_the_map_is_held(drive: tuple) -> None:
+    points, _, _, clouds = drive
+    recovery, rng = RecoverySettings(0.1), np.random.default_rng(1)
+    robust_filter = RecoveringFilter(points, np.array([9e5, -9e5, 0.0]), SETTINGS, recovery, rng)
+    update = robust_filter.step(clouds[0])
+    low, high = points.min(axis=0), points.max(axis=0)
+    np.testing.assert_allclose(update.pose[:2], (high[0] + 64.0, low[1] - 64.0))
+    assert update.is_lost and np.isfinite(update.covariance).all()
+
+
 def test_same_seed_same_track(drive: tuple) -> None:
     start = drive[1][0] + (12.0, 16.0, 0.3)
     np.testing.assert_array_equal(run(drive, start)[0], run(drive, start)[0])

@@ -6,6 +6,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 
 from rol_data import rall
 
@@ -17,6 +18,52 @@ def test_real_map_and_poses_belong_together(real_root: Path) -> None:
     assert points[:, 0].max() < 1500.0 and points[:, 1].max() < 800.0
     near = np.hypot(*(points - poses[4000, :2]).T)
     assert (near < 30.0).sum() > 200 and near.min() > 0.5  # a street with sides, and nothing on the lane
+
+
+@pytest.mark.parametrize(
+    ("place", "number", "n_points", "n_poses"),
+    [("oxford", "10", 399_468, 8_197), ("kaist", "02", 411_501, 3_587), ("dcc", "02", 242_904, 3_026)],
+)
+def test_the_map_of_a_place_leaves_its_roads_free(
+    real_root: Path, place: str, number: str, n_points: int, n_poses: int
+) -> None:
+    points = rall.load_map(real_root, place)
+    poses = rall.load_poses(real_root / rall.PLACES[place].poses.format(number))
+    assert len(points) == n_points and len(poses) == n_poses
+    tree, road = cKDTree(points), poses[::10, :2]
+    steps = ((0, 0), (10, 0), (-10, 0), (0, 10), (0, -10))  # wrong corners: the road leads through walls
+    at, *beside = (np.mean(tree.query(road + step)[0] < 1.5) for step in steps)
+    assert at < 0.3 and at < 0.7 * min(beside)
+
+
+def test_riverside_is_asked_for_by_name(real_root: Path) -> None:
+    if (real_root / rall.PLACES["riverside"].map_path).is_file():
+        assert rall.load_map(real_root, "riverside")[:, 0].max() < 1800.0
+    else:
+        with pytest.raises(rall.RallError, match=r"laser_map_riverside.png: missing"):
+            rall.load_map(real_root, "riverside")
+
+
+def test_places_have_their_own_corner_and_size(tmp_path: Path) -> None:
+    for place, (height, width), corner in (
+        ("kaist", (4000, 4000), (500.0, 200.0)),
+        ("dcc", (3200, 3275), (600.0, 200.0)),
+        ("riverside", (8800, 8800), (1800.0, 1100.0)),
+    ):
+        path = tmp_path / rall.PLACES[place].map_path
+        path.parent.mkdir(parents=True, exist_ok=True)
+        image = np.zeros((height, width), dtype=np.uint8)
+        image[4, 8] = 255
+        cv2.imwrite(str(path), image)
+        np.testing.assert_allclose(rall.load_map(tmp_path, place), [np.subtract(corner, (1.125, 2.125))])
+        assert rall.find_real_root(tmp_path, place) == tmp_path and rall.find_real_root(tmp_path) is None
+        cv2.imwrite(str(path), image[:-1])
+        with pytest.raises(rall.RallError, match=f"laser_map_{place}.png: .*, so their places are not known"):
+            rall.load_map(tmp_path, place)
+    with pytest.raises(
+        rall.RallError, match="place: 'paris' is unknown; there are oxford, kaist, dcc, riverside"
+    ):
+        rall.find_real_root(tmp_path, "paris")
 
 
 def test_real_odometry_follows_the_real_poses(real_root: Path) -> None:

@@ -1,7 +1,7 @@
 """Sessions of the real route: consistency of their parts, evaluation of a recovery, sampled points at real poses."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -14,15 +14,18 @@ from rol_beyond.motion import MotionModel
 from rol_beyond.recovery import DetectionSettings, RecoverySettings
 from rol_beyond.robust import settings_for
 from rol_beyond.scan_matching import ScanToMapSettings
-from rol_data import rall
+from rol_data import cfear, rall
 from rol_study.oxford_route import (
+    ODOMETRIES,
     RouteError,
     RouteSession,
     calibrate_on_another,
+    exact_motion,
     list_sessions,
     load_session,
     published_motion,
     published_reference_contrast,
+    select_sessions,
 )
 from rol_study.route_experiments import (
     RouteExperiment,
@@ -44,15 +47,17 @@ MAP = np.array([[0.0, 0.0], [100.0, 100.0]])
 MAP_ALL = np.array([[-2000.0, -2000.0], [2000.0, 2000.0]])  # holds any route
 
 
-def write_route(root: Path, number: str, n: int = 60, n_steps: int | None = None, **places: tuple) -> Path:
+def write_route(
+    root: Path, number: str, n: int = 60, n_steps: int | None = None, place: str = "oxford", **places: tuple
+) -> Path:
     """Write poses along a line and their steps; `places` moves single poses."""
     poses = np.column_stack([np.linspace(0.0, 50.0, n), np.full(n, 50.0), np.zeros(n)])
-    for row, place in places.items():
-        poses[int(row[1:]), :2] = place
+    for row, position in places.items():
+        poses[int(row[1:]), :2] = position
     steps = np.tile([50.0 / (n - 1), 0.0, 0.0], ((n - 1) if n_steps is None else n_steps, 1))
     for path, rows in (
-        (root / rall.POSES_PATH / f"pose_xy_{number}.txt", poses),
-        (root / rall.ODOMETRY_PATH / f"seq{number}_odom.txt", steps),
+        (root / rall.PLACES[place].poses.format(number), poses),
+        (root / rall.PLACES[place].odometry.format(number), steps),
     ):
         path.parent.mkdir(parents=True, exist_ok=True)
         np.savetxt(path, rows)
@@ -66,6 +71,121 @@ def test_a_session_is_read_with_or_without_its_last_row(tmp_path: Path) -> None:
         np.testing.assert_allclose(route.true_increments, route.increments, atol=1e-6)
         assert np.diff(route.stamps_us).tolist() == [250_000] * 59
     assert list_sessions(tmp_path) == ["03", "04"]
+
+
+@pytest.mark.parametrize("place", ["kaist", "dcc", "riverside"])
+def test_another_place_has_its_own_files(tmp_path: Path, place: str) -> None:
+    for number, n_steps in (("01", 59), ("02", 60), ("03", 58)):
+        write_route(tmp_path, number, n_steps=n_steps, place=place)
+        route = load_session(tmp_path, number, MAP, place)
+        assert (route.place, len(route.truth)) == (place, 59 if number == "03" else 60)
+        assert len(route.increments) == len(route.truth) - 1 == len(route.is_faulty) - 1
+    assert list_sessions(tmp_path, place) == ["01", "02", "03"] and list_sessions(tmp_path) == []
+    assert select_sessions(tmp_path, "all", place) == ["02", "03"]  # 01 made the map
+    assert select_sessions(tmp_path, "01", place) == ["01"]
+    model, other, _ = calibrate_on_another(tmp_path, "01", MAP, place)
+    assert other == "02" and model != published_motion()
+    for number in ("02", "03"):
+        (tmp_path / rall.PLACES[place].poses.format(number)).unlink()
+    assert calibrate_on_another(tmp_path, "01", MAP, place)[:2] == (MotionModel(), "")
+
+
+def test_all_means_the_papers_sessions(tmp_path: Path) -> None:
+    for number in ("01", "02", "08", "09", "10"):
+        write_route(tmp_path, number)
+    assert select_sessions(tmp_path, "all") == ["02", "08", "10"]
+    assert select_sessions(tmp_path, "01") == ["01"]
+    with pytest.raises(RouteError, match=r"oxford has no '07' with rall odometry .*: 01, 02, 08, 09, 10"):
+        select_sessions(tmp_path, "07")
+    with pytest.raises(RouteError, match=r"dcc has no '02' with true odometry at hand; there are: none"):
+        select_sessions(tmp_path, "02", "dcc", "true")
+    with pytest.raises(rall.RallError, match="place: 'paris' is unknown"):
+        select_sessions(tmp_path, "all", "paris")
+
+
+def test_a_scan_that_the_odometry_lacks_is_left_out(tmp_path: Path) -> None:
+    repeated = write_route(tmp_path, "03", n=61, n_steps=59, place="dcc")
+    path = repeated / rall.PLACES["dcc"].poses.format("03")
+    poses = np.loadtxt(path)
+    poses[30] = poses[29]
+    np.savetxt(path, poses)
+    route = load_session(tmp_path, "03", MAP, "dcc")
+    np.testing.assert_allclose(route.truth, np.delete(poses, 30, axis=0))
+    poses[30, 0] += 0.01
+    np.savetxt(path, poses)
+    np.testing.assert_allclose(load_session(tmp_path, "03", MAP, "dcc").truth, poses[:-1])
+
+
+def test_the_real_odometry_of_dcc03_fits_before_and_after_the_missing_scan(real_root: Path) -> None:
+    route = load_session(real_root, "03", MAP_ALL, "dcc")
+    assert (len(route.truth), len(route.increments)) == (3002, 3001)
+    lags = np.arange(-1.5, 1.51, 0.25)  # in scans; MulRan's ground truth is half a scan late
+    for part in (np.arange(20, 118), np.arange(125, 375), np.arange(400, 2900)):
+        errors = [
+            np.median(
+                np.abs(
+                    np.interp(part + lag, np.arange(3001), 0.98 * route.true_increments[:, 0])
+                    - route.increments[part, 0]
+                )
+            )
+            for lag in lags
+        ]
+        assert -0.8 < lags[int(np.argmin(errors))] < -0.2
+
+
+@pytest.mark.parametrize("odometry", ODOMETRIES)
+def test_the_odometry_of_a_session_can_be_chosen(tmp_path: Path, odometry: str) -> None:
+    for number in ("01", "02", "07"):
+        write_route(tmp_path, number)
+        if number in cfear.FILES:
+            path = cfear.find_cfear(tmp_path, number)
+            path.parent.mkdir(parents=True)
+            rows = [f"1 0 0 {0.9 * k} 0 1 0 0 0 0 1 0" for k in range(59)]  # the last pose is missing
+            path.write_text("\n".join(rows), encoding="utf-8")
+    numbers = ["01", "02"] if odometry == "cfear" else ["01", "02", "07"]
+    assert list_sessions(tmp_path, odometry=odometry) == numbers
+    route = load_session(tmp_path, "02", MAP, odometry=odometry)
+    assert (len(route.truth), len(route.increments), len(route.is_faulty), route.odometry) == (
+        *((59, 58, 59) if odometry == "cfear" else (60, 59, 60)),
+        odometry,
+    )
+    step = {"rall": 50.0 / 59, "cfear": 0.9, "true": 50.0 / 59}[odometry]
+    np.testing.assert_allclose(
+        route.increments, np.tile((step, 0.0, 0.0), (len(route.increments), 1)), atol=1e-9
+    )
+    model, other, poses = calibrate_on_another(tmp_path, "02", MAP, odometry=odometry)
+    assert other == "01" and len(poses) == len(route.truth)
+    assert (model == exact_motion()) == (odometry == "true")
+
+
+def test_odometries_that_are_not_there_are_named(tmp_path: Path) -> None:
+    write_route(tmp_path, "07")
+    write_route(tmp_path, "02", place="kaist")
+    for odometry in ("wheels", "cfear-3"):
+        with pytest.raises(
+            RouteError, match=f"odometry: '{odometry}' is unknown; there are rall, cfear, true"
+        ):
+            load_session(tmp_path, "07", MAP, odometry=odometry)
+        with pytest.raises(RouteError, match=f"odometry: '{odometry}' is unknown"):
+            list_sessions(tmp_path, odometry=odometry)
+    with pytest.raises(RouteError, match="CFEAR's is published for Oxford only, not for kaist"):
+        load_session(tmp_path, "02", MAP, "kaist", "cfear")
+    with pytest.raises(cfear.CfearError, match="session 07 is not published"):
+        load_session(tmp_path, "07", MAP, odometry="cfear")
+    (tmp_path / rall.PLACES["oxford"].odometry.format("07")).unlink()
+    assert load_session(tmp_path, "07", MAP, odometry="true").is_faulty is None
+    with pytest.raises(rall.RallError, match=r"seq07_odom.txt: missing"):
+        load_session(tmp_path, "07", MAP)
+
+
+def test_a_part_of_a_session() -> None:
+    truth = np.column_stack([np.arange(10.0), np.zeros((10, 2))])
+    route = RouteSession("02", truth, np.diff(truth, axis=0) * 0.9, "dcc", "cfear", np.arange(10) > 6)
+    part = route.part(5, 8)
+    assert part.truth[:, 0].tolist() == [5.0, 6.0, 7.0] and part.is_faulty.tolist() == [False, False, True]
+    assert part.increments.shape == (2, 3) and (part.place, part.odometry) == ("dcc", "cfear")
+    whole = replace(route, is_faulty=None).part(0)
+    assert len(whole.truth) == 10 and len(whole.increments) == 9 and whole.is_faulty is None
 
 
 def test_parts_that_do_not_belong_together_are_named(tmp_path: Path) -> None:

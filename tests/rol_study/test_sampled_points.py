@@ -1,11 +1,14 @@
 """Points of given precision sampled from a map: visible cells, mixture of kinds, resulting fractions."""
 
+import pickle
+
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
 from rol.geometry import transform_points
 from rol_study.sampled_points import (
+    DenseMapError,
     FrontEnd,
     SampledPointsError,
     find_visible_points,
@@ -42,9 +45,20 @@ def test_mixture_has_the_given_fractions() -> None:
     # 0.16 + 0.3 * 0.8 = 0.4, and 0.16 + 0.04 + 0.5 * 0.8 = 0.6
     np.testing.assert_allclose(mixture, [0.16, 0.04, 0.8])
     with pytest.raises(
-        SampledPointsError, match="0.10 within 1 m and 0.20 within 2 m here: it would need near -0"
+        SampledPointsError,
+        match="0.90 within 1 m and 0.91 within 2 m here: it would need near 0.85, beside -0",
     ):
-        solve_mixture(fractions, 0.1, 0.2)
+        solve_mixture(fractions, 0.9, 0.91)
+
+
+@pytest.mark.parametrize("asked", [(0.1, 0.2), (0.4, 0.49), (0.29, 0.6)])
+def test_a_map_that_is_too_dense_is_named_with_its_chance(asked: tuple[float, float]) -> None:
+    fractions = np.array([[1.0, 0.0, 0.3], [1.0, 1.0, 0.5]])
+    words = f"too dense for points with {asked[0]:.2f} within 1 m and {asked[1]:.2f} within 2 m: by chance 0.30 and 0.50"
+    with pytest.raises(DenseMapError, match=words) as caught:
+        solve_mixture(fractions, *asked)
+    copy = pickle.loads(pickle.dumps(caught.value))  # as a worker process hands it on
+    assert (copy.chance_1m, copy.chance_2m) == (0.3, 0.5) and str(copy) == str(caught.value)
 
 
 @pytest.mark.parametrize(("fraction_1m", "fraction_2m"), [(0.4, 0.6), (0.8, 0.9)])
