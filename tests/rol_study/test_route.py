@@ -121,15 +121,8 @@ def test_the_real_odometry_of_dcc03_fits_before_and_after_the_missing_scan(real_
     assert (len(route.truth), len(route.increments)) == (3002, 3001)
     lags = np.arange(-1.5, 1.51, 0.25)  # in scans; MulRan's ground truth is half a scan late
     for part in (np.arange(20, 118), np.arange(125, 375), np.arange(400, 2900)):
-        errors = [
-            np.median(
-                np.abs(
-                    np.interp(part + lag, np.arange(3001), 0.98 * route.true_increments[:, 0])
-                    - route.increments[part, 0]
-                )
-            )
-            for lag in lags
-        ]
+        steps = [np.interp(part + lag, np.arange(3001), route.true_increments[:, 0]) for lag in lags]
+        errors = [np.median(np.abs(step - 0.98 * route.increments[part, 0])) for step in steps]
         assert -0.8 < lags[int(np.argmin(errors))] < -0.2
 
 
