@@ -2,8 +2,8 @@
 
 python benchmarks/route.py [--real-root DIR] [--jobs 2] [--only seeds,...] [--sessions 02,10] [--seeds 3]
 
-Writes data/ablations/route_<what>.csv row by row; a run that was stopped continues where it ended. The chapter on the
-Oxford route reads these tables, and makes one run of each session itself.
+Writes data/ablations/route_<what>.csv row by row; a run that was stopped continues where it ended. Chapters 11 and 12
+read these tables, and make one run of each session themselves.
 """
 
 from __future__ import annotations
