@@ -165,6 +165,12 @@ STEPS = {
         {"tables": found("data/paper/*.csv"), "measured": found("data/ablations/route_*.csv")},
         {},
     ),
+    "robust_filter": (
+        "12_robust_filter",
+        "the robust filter",
+        {"measured": found("data/ablations/route_*.csv")},
+        {},
+    ),
     "real_radar": ("10_real_radar", "real radar", {"weights": NETWORK, "shipped": SHIPPED}, {}),
     "ablations": (
         "13_ablations",
@@ -192,7 +198,7 @@ BEFORE = {  # commands that come before papermill
     )
 }
 # All others have 0. Those with -1 need no other chapter and fill gaps.
-PRIORITIES = {"real_vs_fake": 1, "oxford_route": -1, "ablations": -1, "runtime": -1}
+PRIORITIES = {"real_vs_fake": 1, "oxford_route": -1, "robust_filter": -1, "ablations": -1, "runtime": -1}
 
 
 rule book:

@@ -42,19 +42,14 @@ CHAPTERS = {
     "08_results": "once",
     "10_real_radar": "once",
     "11_oxford_route": "once",
+    "12_robust_filter": "once",
     "13_ablations": "once",
     "14_runtime": "once",
 }
 LISTS, FOLDERS = ("sessions", "methods"), ("sessions_root", "out_dir", "book_dir")
 CONFIG_KEYS = {"profile", *LISTS, *FOLDERS, "seed", "notebooks", "simulated"}
 OPTIONAL_KEYS = {"real_root"}
-SHARED = (
-    "sessions_root",
-    "sessions",
-    "out_dir",
-    "seed",
-    "real_root",
-)  # keys that are parameters of notebooks
+SHARED = ("sessions_root", "sessions", "out_dir", "seed", "real_root")  # keys that are parameters of notebooks
 
 
 class ChapterError(ValueError):

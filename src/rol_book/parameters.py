@@ -31,12 +31,12 @@ FROM_REPOSITORY = "it comes with the repository"
 CHOICES: dict[str, tuple[Any, ...]] = {  # parameter -> all its values
     "bf16": ("auto", True, False),
     "device": ("cpu", "cuda"),
-    "measurement": ("statistical", "rendered"),
     "method": ("paper", "robust"),
     "motion": ("none", "corrected"),
+    "place": ("oxford", "kaist", "dcc", "riverside"),
     "points_source": ("raw", "fake", "real", "fake-corrected"),
 }
-MAY_BE_ZERO = ("seed", "twin_seed", "scan_number", "rendered_first", "gap_scans", "steps", "n_blocks")
+MAY_BE_ZERO = ("seed", "twin_seed", "scan_number", "kidnapped_at", "gap_scans", "steps", "n_blocks")
 NETWORKS = {
     "network": "safetensors",
     "compared": "safetensors",

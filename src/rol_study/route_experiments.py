@@ -17,6 +17,7 @@ import numpy as np
 from rol.evaluation import FailureMonitor, FailureRule
 from rol.geometry import compose, relative_pose
 from rol.mcl import MapGrid, MclSettings, ParticleFilter, localize
+from rol.radar import ScanMotion, compensate_points
 from rol_beyond.motion import MotionModel, gate_odometry
 from rol_beyond.recovery import (
     RecoveringFilter,
@@ -26,7 +27,7 @@ from rol_beyond.recovery import (
 )
 from rol_beyond.robust import settings_for
 from rol_beyond.scan_matching import ScanToMapSettings, scan_to_map_icp
-from rol_data.rall import MAP_PATH, MAP_SHAPE, load_map_points
+from rol_data.rall import load_map
 from rol_study.oxford_route import (
     SCAN_US,
     RouteSession,
@@ -43,6 +44,7 @@ from rol_study.sampled_points import (
     solve_mixture,
 )
 
+N_REFERENCE = 300  # scans of the other session on which the reference contrast is measured
 CELL_M = 0.25  # of the filters' grids: the pixel of the real map
 
 
@@ -60,6 +62,9 @@ class RouteExperiment:
         Properties of the sampled points.
     visible : VisiblePoints
         Points of the map visible from each true pose.
+    mixture_poses, calibration_poses : array, shape (k, 3)
+        Ground-truth poses of the whole session, for `parts`, and of the other one, for `reference_contrast`
+        [m, m, rad].
     parts : array, shape (3,)
         Parts of near points, points beside and false ones that have the front end's precision over the whole session.
     motion : MotionModel
@@ -77,6 +82,8 @@ class RouteExperiment:
     map_points: np.ndarray
     front_end: FrontEnd
     visible: VisiblePoints
+    mixture_poses: np.ndarray
+    calibration_poses: np.ndarray
     parts: np.ndarray
     motion: MotionModel
     calibration_session: str
@@ -89,8 +96,9 @@ def prepare_experiment(
     number: str,
     front_end: FrontEnd,
     *,
+    place: str = "oxford",
+    odometry: str = "rall",
     max_scans: int = 0,
-    n_reference: int = 300,
     settings: MclSettings | None = None,
 ) -> RouteExperiment:
     """Load a session and the map, find the visible points of all poses, and calibrate on another session.
@@ -103,10 +111,10 @@ def prepare_experiment(
         Session, such as "02".
     front_end : FrontEnd
         Properties of the sampled points.
+    place, odometry : str
+        See `rol_study.oxford_route.load_session`; the motion model is calibrated on the same odometry.
     max_scans : int
         Use only the first scans, 0 for all.
-    n_reference : int
-        Scans of the other session on which the reference contrast is measured.
     settings : MclSettings, optional
         Of the filter that the reference contrast is for; those of the method `robust` if not given.
 
@@ -119,18 +127,47 @@ def prepare_experiment(
     rol_data.rall.RallError, rol_study.oxford_route.RouteError
         If the files are missing or faulty.
     """
-    map_points = load_map_points(Path(real_root, MAP_PATH), MAP_SHAPE)
-    session = load_session(real_root, number, map_points)
-    sample = session.truth[np.linspace(0, len(session.truth) - 1, 200).astype(int)]
-    parts = _find_parts(map_points, sample, front_end)
+    map_points = load_map(real_root, place)
+    session = load_session(real_root, number, map_points, place, odometry)
+    mixture_poses = _choose(session.truth, 200)
     if max_scans:
-        session = RouteSession(number, session.truth[:max_scans], session.increments[: max_scans - 1])
-    motion, other, poses = calibrate_on_another(real_root, number, map_points)
-    poses = poses[np.linspace(0, len(poses) - 1, min(n_reference, len(poses))).astype(int)]
+        session = session.part(0, max_scans)
+    motion, other, poses = calibrate_on_another(real_root, number, map_points, place, odometry)
     grid = (settings or settings_for("robust")).measurement.build_grid(map_points)
-    reference = _measure_reference(map_points, poses, front_end, grid)
     visible = find_visible_points(map_points, session.truth)
-    return RouteExperiment(session, map_points, front_end, visible, parts, motion, other, reference, grid)
+    own = session, map_points, front_end, visible, mixture_poses, _choose(poses, N_REFERENCE)
+    return change_front_end(RouteExperiment(*own, np.ones(3) / 3, motion, other, 0.0, grid), front_end)
+
+
+def _choose(poses: np.ndarray, n: int) -> np.ndarray:
+    """Choose n poses evenly, or all if there are fewer."""
+    return poses[np.linspace(0, len(poses) - 1, min(n, len(poses))).astype(int)]
+
+
+def change_front_end(experiment: RouteExperiment, front_end: FrontEnd) -> RouteExperiment:
+    """Give the same experiment with the points of another front end.
+
+    Parameters
+    ----------
+    experiment : RouteExperiment
+        Session, map and calibration.
+    front_end : FrontEnd
+        Properties of the sampled points.
+
+    Returns
+    -------
+    experiment : RouteExperiment
+        With the parts and the reference contrast that belong to the front end.
+
+    Raises
+    ------
+    rol_study.sampled_points.SampledPointsError
+        If no mixture of points has the front end's fractions on this map.
+    """
+    e = experiment
+    parts = _find_parts(e.map_points, e.mixture_poses, front_end)
+    reference = _measure_reference(e.map_points, e.calibration_poses, front_end, e.grid)
+    return replace(e, front_end=front_end, parts=parts, reference_contrast=reference)
 
 
 def _measure_reference(
@@ -607,3 +644,23 @@ def add_outliers(session: RouteSession, fraction: float, rng: np.random.Generato
     turns = np.deg2rad(rng.uniform(-5.0, 5.0, n))
     increments[chosen] += np.column_stack([lengths * np.cos(angles), lengths * np.sin(angles), turns])
     return replace(session, increments=increments)
+
+
+def skew_by_motion(clouds: Iterable[np.ndarray], true_increments: np.ndarray) -> list[np.ndarray]:
+    """Distort the points of each scan as the motion during the turn and the Doppler shift do without compensation.
+
+    Parameters
+    ----------
+    clouds : iterable of array, shape (m, 2)
+        Points of each of n scans in the radar frame at mid-scan [m].
+    true_increments : array, shape (n - 1, 3)
+        Motion from each scan to the next [m, m, rad].
+
+    Returns
+    -------
+    clouds : list of array, shape (m, 2)
+        `rol.radar.compensate_points` with the opposite motion, whose inverse it is to first order [m].
+    """
+    twists = true_increments[np.minimum(np.arange(len(true_increments) + 1), len(true_increments) - 1)]
+    twists = twists / (SCAN_US * 1e-6)
+    return [compensate_points(cloud, ScanMotion(-twist)) for cloud, twist in zip(clouds, twists, strict=True)]

@@ -5,6 +5,7 @@ A table is written row by row; a run that was stopped continues where it ended.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import replace
 from functools import lru_cache
@@ -14,7 +15,7 @@ import numpy as np
 import pandas as pd
 import torch
 
-from rol.evaluation import pose_errors, summarize
+from rol.evaluation import METRICS, pose_errors, rmse, summarize
 from rol.files import write_text
 from rol.mcl import MclSettings, Measurement
 from rol.pix2pix import load_network
@@ -23,29 +24,53 @@ from rol_beyond.consistency import consistency
 from rol_beyond.motion import MotionModel
 from rol_beyond.recovery import DetectionSettings, RecoverySettings
 from rol_beyond.robust import settings_for
-from rol_data.rall import POSES_PATH, load_poses
-from rol_study.oxford_route import RouteSession, list_sessions
+from rol_data.rall import PLACES, POSES_PATH, load_poses
+from rol_study.oxford_route import list_sessions
 from rol_study.rendered_points import build_segment, render_points
 from rol_study.route_experiments import (
     FilterRun,
     RouteExperiment,
     add_outliers,
+    change_front_end,
     kidnap,
     localize_globally,
     prepare_experiment,
     run_method,
     sample_session,
+    skew_by_motion,
 )
-from rol_study.sampled_points import FrontEnd
+from rol_study.sampled_points import FrontEnd, fraction_within_2m
 
+PAPER_SESSIONS = PLACES["oxford"].main_sessions  # Seq01 to Seq04 of the paper; session 01 made the map
 SHORT = 3000  # scans of the runs that compare settings
+QUALITIES = (0.44, 0.47, 0.50, 0.35, 0.60, 0.30, 0.80)  # within 1 m; 0.40 is the table "seeds"
+COMPARED = (0.40, 0.47)  # qualities at which settings and causes are compared
 DEG = float(np.deg2rad(1.0))
 SETTINGS = {
     "particles": [("n_particles", n) for n in (50, 100, 500, 2000)],
-    "lambda": [("exponent", value) for value in (1.0, 5.0, 20.0, 80.0)],
-    "d_th [m]": [("d_th_m", value) for value in (0.25, 0.5, 1.0, 2.0)],
-    "noise": [("noise", value) for value in (0.2, 0.5, 1.0, 2.0)],
+    "lambda": [("exponent", value) for value in (1.0, 5.0, 20.0, 80.0, 320.0)],
+    "d_th [m]": [("d_th_m", value) for value in (0.125, 0.25, 0.5, 1.0, 2.0)],
+    "noise": [("noise", value) for value in (0.05, 0.1, 0.2, 0.5, 1.0, 2.0)],
 }
+FLAT = {"exponent": 1.0}
+TWICE = {"forward_m": 1.0, "left_m": 0.6, "yaw_rad": 2.0 * DEG}
+LASTING = {"persistent_fraction": 1.0, "life_scans": 40.0}
+# What could make the paper's errors larger: changes of the filter, of the points, and whether motion is compensated.
+CAUSES = {
+    "as in the tables": ({}, {}, True),
+    "flat weights": (FLAT, {}, True),
+    "twice the motion noise": (TWICE, {}, True),
+    "matching distance of 2 m": ({"d_th_m": 2.0}, {}, True),
+    "100 points a scan": ({}, {"n_points": 100}, True),
+    "all false points last for 10 s": ({}, LASTING, True),
+    "motion not compensated": ({}, {}, False),
+    "flat weights and motion not compensated": (FLAT, {}, False),
+    "flat weights and lasting false points": (FLAT, LASTING, True),
+}
+COMPARED_ODOMETRIES = ("true", "cfear")
+CLASSES = ("within_1m_2deg", "within_2m_5deg", "within_5m_10deg")
+TEXT = dict.fromkeys(("job", "session", "odometry"), str)  # pandas reads "true" as a truth value
+RUN_COLUMNS = ["fraction_1m", "odometry", *METRICS]
 INGREDIENTS = {
     "all of robust": {},
     "all places of the map alike": {"density_radius_m": 0.0},
@@ -60,22 +85,36 @@ RECOVERIES = {
     "standing scans count in full": {"stationary_weight": 1.0},
 }
 INGREDIENTS |= {name: {} for name in (*RECOVERIES, UNCALIBRATED)}
-NARROW = {"d_th_m": 0.25}
+NARROW = {"d_th_m": 0.25}  # the best of the first sweep on session 02, whose ends these were
 QUIET = {"forward_m": 0.1, "left_m": 0.06, "yaw_rad": 0.2 * DEG}
 TUNED = {"both": NARROW | QUIET, "d_th of 0.25 m": NARROW, "a fifth of the noise": QUIET}
-FRONTS = ((0.40, 0.60), (0.50, 0.70), (0.65, 0.80), (0.80, 0.90))
+
+
+@lru_cache(maxsize=1)
+def session_of(
+    real_root: str,
+    number: str,
+    max_scans: int = 0,
+    settings: MclSettings | None = None,
+    odometry: str = "rall",
+) -> RouteExperiment:
+    """Prepare the experiment once per worker and session, with the paper's front end."""
+    how = {"max_scans": max_scans, "settings": settings, "odometry": odometry}
+    return prepare_experiment(real_root, number, FrontEnd(), **how)
 
 
 @lru_cache(maxsize=1)
 def experiment_of(
-    real_root: str,
-    number: str,
-    shares: tuple[float, float] = (0.40, 0.60),
-    max_scans: int = 0,
-    settings: MclSettings | None = None,
+    real_root: str, number: str, front_end: FrontEnd | None = None, max_scans: int = 0, **how: object
 ) -> RouteExperiment:
-    """Prepare the experiment once per worker and session."""
-    return prepare_experiment(real_root, number, FrontEnd(*shares), max_scans=max_scans, settings=settings)
+    """Prepare the experiment once per worker, session and front end."""
+    experiment = session_of(real_root, number, max_scans, **how)
+    return experiment if front_end is None else change_front_end(experiment, front_end)
+
+
+def front_end_of(fraction_1m: float, **changes: float) -> FrontEnd:
+    """Give the front end with a fraction of its points within 1 m, and `fraction_within_2m` of it within 2 m."""
+    return FrontEnd(fraction_1m, fraction_within_2m(fraction_1m), **changes)
 
 
 def row_of(experiment: RouteExperiment, run: FilterRun, method: str, seed: int) -> dict:
@@ -84,7 +123,11 @@ def row_of(experiment: RouteExperiment, run: FilterRun, method: str, seed: int) 
     about = {"method": method, "session": experiment.session.number, "seed": seed}
     update_ms = float(np.median(run.update_ms))
     row = summarize(run.poses, truth, failures=len(run.failures), update_ms_median=update_ms, **about)
+    is_faulty = experiment.session.is_faulty
+    is_sound = np.ones(len(truth), dtype=bool) if is_faulty is None else ~is_faulty
     return row | {
+        "n_faulty": int((~is_sound).sum()),
+        "rmse_sound_m": rmse(errors.position_m[is_sound]),
         "median_m": float(np.median(errors.position_m)),
         "median_yaw_deg": float(np.rad2deg(np.median(np.abs(errors.yaw_rad)))),
         "largest_m": float(errors.position_m.max()),
@@ -122,9 +165,43 @@ def measure_seeds(real_root: str, number: str, seed: int) -> list[dict]:
     ]
 
 
-def measure_settings(real_root: str, number: str, seed: int) -> list[dict]:
+def measure_quality(real_root: str, number: str, fraction_1m: float, seed: int) -> list[dict]:
+    """Run both methods over a whole session with points of another quality."""
+    experiment = experiment_of(real_root, number, front_end_of(fraction_1m))
+    clouds, about = sample_session(experiment, seed), {"fraction_1m": fraction_1m}
+    return [
+        about | row_of(experiment, run_method(experiment, method, clouds, seed), method, seed)
+        for method in ("paper", "robust")
+    ]
+
+
+def measure_odometry(real_root: str, number: str, odometry: str, fraction_1m: float, seed: int) -> list[dict]:
+    """Run both methods over a whole session with another odometry, each calibrated on it."""
+    experiment = experiment_of(real_root, number, front_end_of(fraction_1m), odometry=odometry)
+    clouds, about = sample_session(experiment, seed), {"odometry": odometry, "fraction_1m": fraction_1m}
+    return [
+        about | row_of(experiment, run_method(experiment, method, clouds, seed), method, seed)
+        for method in ("paper", "robust")
+    ]
+
+
+def measure_causes(real_root: str, number: str, fraction_1m: float, seed: int) -> list[dict]:
+    """Run the method `paper` with one possible cause of larger errors after the other."""
+    rows = []
+    for name, (settings, points, is_compensated) in CAUSES.items():
+        experiment = experiment_of(real_root, number, front_end_of(fraction_1m, **points), SHORT)
+        clouds = sample_session(experiment, seed)
+        if not is_compensated:
+            clouds = skew_by_motion(clouds, experiment.session.true_increments)
+        run = run_method(experiment, "paper", clouds, seed, **settings)
+        about = {"cause": name, "fraction_1m": fraction_1m}
+        rows.append(about | row_of(experiment, run, "paper", seed))
+    return rows
+
+
+def measure_settings(real_root: str, number: str, fraction_1m: float, seed: int) -> list[dict]:
     """Run the method `paper` with one setting after the other changed."""
-    experiment, rows = experiment_of(real_root, number, (0.40, 0.60), SHORT), []
+    experiment, rows = experiment_of(real_root, number, front_end_of(fraction_1m), SHORT), []
     clouds = sample_session(experiment, seed)
     for name, values in SETTINGS.items():
         for setting, value in values:
@@ -132,7 +209,8 @@ def measure_settings(real_root: str, number: str, seed: int) -> list[dict]:
             if setting == "noise":
                 changes = {"forward_m": 0.5 * value, "left_m": 0.3 * value, "yaw_rad": value * DEG}
             run = run_method(experiment, "paper", clouds, seed, **changes)
-            rows.append({"what": name, "value": value, **row_of(experiment, run, "paper", seed)})
+            about = {"what": name, "value": value, "fraction_1m": fraction_1m}
+            rows.append(about | row_of(experiment, run, "paper", seed))
     return rows
 
 
@@ -163,19 +241,9 @@ def measure_registration(real_root: str, number: str, seed: int) -> list[dict]:
     return [row_of(experiment, run, "registration", seed)]
 
 
-def measure_fronts(real_root: str, number: str, share_1m: float, share_2m: float, seed: int) -> list[dict]:
-    """Run both methods with better and better front ends."""
-    experiment = experiment_of(real_root, number, (share_1m, share_2m), SHORT)
-    clouds, shares = sample_session(experiment, seed), {"share_1m": share_1m, "share_2m": share_2m}
-    return [
-        shares | row_of(experiment, run_method(experiment, m, clouds, seed), m, seed)
-        for m in ("paper", "robust")
-    ]
-
-
 def measure_outliers(real_root: str, number: str, share: float, seed: int) -> list[dict]:
     """Run both methods with outliers in the odometry."""
-    experiment = experiment_of(real_root, number, (0.40, 0.60), SHORT)
+    experiment = experiment_of(real_root, number, None, SHORT)
     disturbed = replace(
         experiment, session=add_outliers(experiment.session, share, np.random.default_rng(seed))
     )
@@ -191,14 +259,10 @@ def measure_rendered(
 ) -> list[dict]:
     """Run both methods on points generated from the simulated radar, on a segment that the network was not trained on."""
     torch.set_num_threads(1)
-    experiment = experiment_of(real_root, number, (0.80, 0.88))
+    experiment = experiment_of(real_root, number, FrontEnd(0.80, 0.88))
     simulated = build_segment(real_root, number, first, n_scans, seed)
     clouds = list(render_points(simulated, load_network(weights)))
-    truth, increments = (
-        experiment.session.truth[first : first + n_scans],
-        experiment.session.increments[first : first + n_scans - 1],
-    )
-    part = replace(experiment, session=RouteSession(number, truth, increments))
+    part = replace(experiment, session=experiment.session.part(first, first + n_scans))
     return [
         row_of(part, run_method(part, method, clouds, seed), method, seed) for method in ("paper", "robust")
     ]
@@ -218,8 +282,10 @@ def measure_trial(what: str):
 
 MEASURES = {
     "seeds": measure_seeds,
+    "quality": measure_quality,
+    "causes": measure_causes,
     "settings": measure_settings,
-    "fronts": measure_fronts,
+    "odometry": measure_odometry,
     "ingredients": measure_ingredients,
     "tuned": measure_tuned,
     "registration": measure_registration,
@@ -231,28 +297,33 @@ MEASURES = {
 
 
 def list_jobs(real_root: str) -> dict[str, list[tuple]]:
-    """List the jobs of each table. Wrong starts are drawn once, from all sessions but the mapping one."""
+    """List the jobs of each table; each ends with its seed. Wrong starts are drawn once, from sessions 02 and 07."""
     numbers, rng = list_sessions(real_root), np.random.default_rng(2020)
-    driven = [number for number in numbers if number != "01"] or numbers
-    lengths = {number: len(load_truth(real_root, number)) for number in driven}
+    ours = [number for number in ("01", *PAPER_SESSIONS) if number in numbers] or numbers
+    driven = [number for number in ours if number != "01"] or ours
+    starts = [number for number in ("02", "07") if number in numbers] or driven
+    lengths = {number: len(load_truth(real_root, number)) for number in starts}
 
     def places(n: int, seconds: float) -> list[tuple]:
-        picked = [driven[k % len(driven)] for k in range(n)]
+        picked = [starts[k % len(starts)] for k in range(n)]
         return sorted(
             (name, int(rng.integers(100, lengths[name] - 4 * seconds)), k) for k, name in enumerate(picked)
         )
 
     first = driven[0]
+    last_first = sorted(driven, key=lambda number: (number not in (first, driven[-1]), number))
     return {
-        "seeds": [(number, seed) for seed in range(1, 11) for number in numbers],
+        "seeds": [(number, seed) for seed in range(1, 11) for number in ours],
         "kidnapped": places(100, 15),
-        "settings": [(first, seed) for seed in (1, 2, 3)],
+        "quality": [(number, q, seed) for number in last_first for q in QUALITIES for seed in (1, 2, 3)],
+        "causes": [(n, q, seed) for n in last_first[:2] for q in COMPARED for seed in (1, 2, 3)],
+        "settings": [(first, quality, seed) for quality in COMPARED for seed in (1, 2, 3)],
+        "odometry": list_odometry(last_first[:2]),
         "outliers": [(first, share, seed) for share in (0.015, 0.05) for seed in (1, 2, 3)],
         "anywhere": places(50, 120),
-        "ingredients": [(driven[-1], name, seed) for name in INGREDIENTS for seed in (1, 2, 3, 4, 5)],
-        "tuned": list_tuned(numbers),
-        "registration": [(number, seed) for seed in (1, 2) for number in numbers],
-        "fronts": [(first, *shares, seed) for shares in FRONTS for seed in (1, 2, 3)],
+        "ingredients": [(starts[-1], name, seed) for name in INGREDIENTS for seed in (1, 2, 3, 4, 5)],
+        "tuned": list_tuned(ours),
+        "registration": [(number, seed) for seed in (1, 2) for number in ours],
         "rendered": [key for key in (("02", 6000, 400, 1), ("07", 5050, 400, 1)) if key[0] in numbers],
     }
 
@@ -263,31 +334,62 @@ def list_tuned(numbers: list[str]) -> list[tuple]:
     return [(number, what, seed) for number in judged for what in TUNED for seed in (1, 2, 3)]
 
 
+def list_odometry(numbers: list[str]) -> list[tuple]:
+    """List the jobs with another odometry; CFEAR's is published for sessions 01 and 02."""
+    wanted = [
+        (number, name)
+        for number in numbers
+        for name in COMPARED_ODOMETRIES
+        if number == "02" or name == "true"
+    ]
+    return [(*key, quality, seed) for quality in (0.40, 0.50) for seed in (1, 2, 3) for key in wanted]
+
+
 def load_truth(real_root: str, number: str) -> np.ndarray:
     """Read the ground-truth poses of a session."""
     return load_poses(Path(real_root, POSES_PATH, f"pose_xy_{number}.txt"))
 
 
 def run_table(
-    pool: ProcessPoolExecutor, what: str, jobs: list[tuple], path: Path, *, real_root: str, weights: str
+    pool: ProcessPoolExecutor,
+    what: str,
+    jobs: list[tuple],
+    path: Path,
+    *,
+    is_chosen: Callable[[tuple], bool] = bool,
+    **files: str,
 ) -> None:
     """Run the jobs that the table of a file lacks, and write the table after each.
+
+    Parameters
+    ----------
+    pool : concurrent.futures.Executor
+        Runs the jobs.
+    what : str
+        Name of the table, one of `MEASURES`.
+    jobs : list of tuple
+        All jobs of the table, from `list_jobs`.
+    path : pathlib.Path
+        File of the table.
+    is_chosen : callable
+        Run only the jobs for which this is true.
+    **files
+        ``real_root`` and ``weights``, see `measure`.
 
     Raises
     ------
     ValueError
         If the table holds jobs that are not listed, such as those of another set of sessions; nothing is dropped.
     """
-    table = (
-        pd.read_csv(path, dtype={"session": str, "job": str}) if path.is_file() else pd.DataFrame({"job": []})
-    )
+    table = pd.read_csv(path, dtype=TEXT) if path.is_file() else pd.DataFrame({"job": []})
     wanted = [" ".join(map(str, key)) for key in jobs]
     if unlisted := sorted(set(table.job) - set(wanted)):
         raise ValueError(
             f"{path}: {len(unlisted)} jobs are not listed, such as {unlisted[0]!r}; move the file away"
         )
     missing = [key for key, name in zip(jobs, wanted, strict=True) if name not in set(table.job)]
-    running = [pool.submit(measure, real_root, weights, what, key) for key in missing]
+    missing = [key for key in missing if is_chosen(key)]
+    running = [pool.submit(measure, files["real_root"], files["weights"], what, key) for key in missing]
     for done, future in enumerate(as_completed(running), start=1):
         rows = future.result()
         table = (
@@ -296,3 +398,68 @@ def run_table(
         table = table.sort_values("job", kind="stable")
         write_text(path, table.to_csv(index=False, float_format="%.5g"))
         print(f"{what} {done}/{len(missing)}: {rows[0]['job']}", flush=True)
+
+
+def load_table(folder: Path | str, what: str) -> pd.DataFrame:
+    """Load a stored table.
+
+    Parameters
+    ----------
+    folder : path
+        Folder of the tables, ``data/ablations`` of the repository.
+    what : str
+        Name of the table, one of `MEASURES`.
+
+    Returns
+    -------
+    table : pandas.DataFrame
+        One row per run; without rows and columns where the table is missing.
+    """
+    path = Path(folder, f"route_{what}.csv")
+    return pd.read_csv(path, dtype=TEXT) if path.is_file() else pd.DataFrame()
+
+
+def load_runs(folder: Path | str) -> pd.DataFrame:
+    """Load the stored runs of both methods over whole sessions: seeds, qualities and odometries.
+
+    Parameters
+    ----------
+    folder : path
+        Folder of the tables.
+
+    Returns
+    -------
+    runs : pandas.DataFrame
+        One row per run: the columns of `row_of`, ``fraction_1m`` of the points, and ``odometry``, which is "rall"
+        for the authors' own.
+    """
+    own = {"seeds": {"fraction_1m": 0.40}, "quality": {}, "odometry": {}}
+    tables = [load_table(folder, what).assign(**about) for what, about in own.items()]
+    runs = pd.concat([table for table in tables if len(table)] or [pd.DataFrame(columns=RUN_COLUMNS)])
+    runs = runs.reindex(columns=[*RUN_COLUMNS, *runs.columns.difference(RUN_COLUMNS, sort=False)])
+    return runs.assign(odometry=runs.odometry.fillna("rall")).drop(columns="job", errors="ignore")
+
+
+def summarize_runs(runs: pd.DataFrame, by: list[str]) -> pd.DataFrame:
+    """Average runs over seeds and sessions, group by group.
+
+    Parameters
+    ----------
+    runs : pandas.DataFrame
+        Rows of `row_of`.
+    by : list of str
+        Columns that make a group.
+
+    Returns
+    -------
+    groups : pandas.DataFrame
+        Indexed by `by`: ``n_runs``, ``n_sessions`` and ``n_seeds``; means of ``rmse_m`` [m] with ``min_m`` and ``max_m``
+        over the runs, of ``rmse_yaw_deg`` [deg] and of the three classes [%]; ``failures`` per run.
+    """
+    measures = {name: (name, "mean") for name in ("rmse_m", "rmse_yaw_deg", *CLASSES, "failures")}
+    groups = runs.groupby(by).agg(
+        n_runs=("seed", "size"), n_sessions=("session", "nunique"), n_seeds=("seed", "nunique"),
+        min_m=("rmse_m", "min"), max_m=("rmse_m", "max"), **measures,
+    )  # fmt: skip
+    groups[list(CLASSES)] *= 100.0
+    return groups

@@ -25,6 +25,9 @@ from rol.compiled import compiled
 from rol.geometry import check_fields, check_grid, check_poses, invert, transform_points
 
 KINDS = ("near", "beside", "false")
+BEYOND = (
+    2.0 / 3.0
+)  # of the points beyond 1 m of the map, this fraction is beyond 2 m, see `fraction_within_2m`
 
 
 class SampledPointsError(ValueError):
@@ -94,6 +97,24 @@ class FrontEnd:
             "(0, inf)": "max_range_m",
         }
         check_fields(self, allowed, SampledPointsError)
+
+
+def fraction_within_2m(fraction_1m: float) -> float:
+    """Give the fraction of points within 2 m of the map that real front ends have with a fraction within 1 m.
+
+    Parameters
+    ----------
+    fraction_1m : float
+        Fraction of the points within 1 m of the map.
+
+    Returns
+    -------
+    fraction_2m : float
+        Rounded to two digits. Two thirds of the points beyond 1 m are beyond 2 m: with the paper's 40 % and 60 %
+        (Sec. IV-B), with the peaks of eleven real scans near the real map, 70 % and 80 %, and nearly with the points
+        that a network generates from these scans, 80 % and 85 %.
+    """
+    return round(1.0 - BEYOND * (1.0 - fraction_1m), 2)
 
 
 @dataclass(frozen=True)

@@ -10,6 +10,7 @@ import pytest
 from rol.evaluation import FailureRule, pose_errors, rmse
 from rol.geometry import compose, transform_points
 from rol.mcl import ParticleFilter
+from rol.radar import ScanMotion, compensate_points
 from rol_beyond.motion import MotionModel
 from rol_beyond.recovery import DetectionSettings, RecoverySettings
 from rol_beyond.robust import settings_for
@@ -30,6 +31,7 @@ from rol_study.oxford_route import (
 from rol_study.route_experiments import (
     RouteExperiment,
     add_outliers,
+    change_front_end,
     displace,
     evaluate_recovery,
     kidnap,
@@ -39,6 +41,7 @@ from rol_study.route_experiments import (
     run_paper,
     run_scan_to_map,
     sample_session,
+    skew_by_motion,
 )
 from rol_study.sampled_points import FrontEnd
 
@@ -240,6 +243,15 @@ def test_a_session_alone_is_not_calibrated_on_itself(real_root: Path, tmp_path: 
     )
 
 
+def test_another_front_end_is_the_same_as_prepared_with_it(real_root: Path) -> None:
+    better = FrontEnd(0.47, 0.65)
+    changed = change_front_end(prepare_experiment(real_root, "02", FrontEnd(), max_scans=3), better)
+    prepared = prepare_experiment(real_root, "02", better, max_scans=3)
+    assert changed.front_end == better and len(changed.session.truth) == 3
+    np.testing.assert_array_equal(changed.parts, prepared.parts)
+    assert changed.reference_contrast == prepared.reference_contrast
+
+
 @pytest.fixture(scope="module")
 def street() -> tuple[RouteSession, np.ndarray, list[np.ndarray]]:
     """A drive of 40 scans between rows of posts, its odometry a little short, and what is near in each scan."""
@@ -315,9 +327,25 @@ def test_the_papers_filter_is_bounded_by_the_resets_of_its_evaluation(street: tu
 @pytest.mark.parametrize("first", [-20, 40])
 def test_a_start_at_no_scan_of_the_session_is_refused(street: tuple, begin: Callable, first: int) -> None:
     route, posts, _ = street
-    experiment = RouteExperiment(route, posts, FrontEnd(), None, None, MotionModel(), "", 0.2, None)
+    experiment = RouteExperiment(
+        route, posts, FrontEnd(), None, route.truth, route.truth, None, MotionModel(), "", 0.2, None
+    )
     with pytest.raises(ValueError, match=f"first: {first} is no scan of session .*, which has 40"):
         begin(experiment, first, 1)
+
+
+def test_points_are_skewed_by_the_motion_of_their_own_scan(street: tuple) -> None:
+    route, _, clouds = street
+    skewed = skew_by_motion(clouds, route.true_increments)
+    for index in (0, 20, 39):
+        twist = route.true_increments[min(index, 38)] / 0.25
+        again = compensate_points(skewed[index], ScanMotion(twist))
+        x, y = clouds[index].T
+        near = (np.hypot(x, y) < 50.0) & (np.abs(np.arctan2(y, x)) > 0.2)  # away from the turn's beginning
+        moved = np.hypot(*(skewed[index] - clouds[index])[near].T)
+        assert 0.5 < moved.max() < 1.5 and np.abs(again - clouds[index])[near].max() < 0.15 * moved.max()
+    still = skew_by_motion(clouds, np.zeros((39, 3)))
+    np.testing.assert_allclose(still[7], clouds[7], atol=1e-9)
 
 
 def test_a_run_takes_the_registration_and_other_recovery_settings(street: tuple) -> None:
@@ -327,6 +355,8 @@ def test_a_run_takes_the_registration_and_other_recovery_settings(street: tuple)
         posts,
         FrontEnd(),
         None,
+        route.truth,
+        route.truth,
         None,
         MotionModel(),
         "",

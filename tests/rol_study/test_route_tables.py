@@ -1,6 +1,7 @@
 """What the long measurement on the real route asks for, and how it keeps its tables."""
 
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -9,11 +10,19 @@ import pandas as pd
 import pytest
 
 from rol_beyond.motion import MotionModel
+from rol_data import rall
 from rol_study import route_tables
 from rol_study.oxford_route import RouteSession, published_motion
 from rol_study.route_experiments import FilterRun, RouteExperiment
 
 N = 30
+
+
+def write_route(root: Path, number: str, n: int) -> None:
+    """Write poses along a line, and as many increments."""
+    for name in (f"{rall.POSES_PATH}/pose_xy_{number}.txt", f"{rall.ODOMETRY_PATH}/seq{number}_odom.txt"):
+        (root / name).parent.mkdir(parents=True, exist_ok=True)
+        np.savetxt(root / name, np.column_stack([np.arange(n), np.zeros((n, 2))]))
 
 
 @pytest.fixture
@@ -22,21 +31,30 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> list[SimpleNamespace]:
     truth = np.column_stack([np.arange(N), np.zeros((N, 2))])
     experiment = RouteExperiment(
         RouteSession("07", truth, np.diff(truth, axis=0)), np.zeros((9, 2)), route_tables.FrontEnd(),
-        None, None, published_motion(), "01", 0.05, None,
+        None, truth, truth, None, published_motion(), "01", 0.05, None,
     )  # fmt: skip
     noted = []
 
     def run(experiment, method, clouds, seed, *, recovery=None, **changes) -> FilterRun:
         noted.append(
             SimpleNamespace(
-                experiment=experiment, method=method, recovery=recovery, changes=changes, seed=seed
+                experiment=experiment,
+                method=method,
+                recovery=recovery,
+                changes=changes,
+                seed=seed,
+                clouds=np.array(clouds),
             )
         )
         spread = np.full((N, 3, 3), np.nan) if method == "registration" else np.tile(np.eye(3), (N, 1, 1))
         return FilterRun(truth, spread, [], np.zeros(N, dtype=bool), np.ones(N), np.full(N, 100), np.ones(N))
 
-    monkeypatch.setattr(route_tables, "experiment_of", lambda *a, **k: experiment)
-    monkeypatch.setattr(route_tables, "sample_session", lambda experiment, seed: [])
+    def prepare(real_root, number, front_end=None, max_scans=0, settings=None, odometry="rall"):
+        session = replace(experiment.session, odometry=odometry)
+        return replace(experiment, front_end=front_end or route_tables.FrontEnd(), session=session)
+
+    monkeypatch.setattr(route_tables, "experiment_of", prepare)
+    monkeypatch.setattr(route_tables, "sample_session", lambda experiment, seed: [np.ones((1, 2))] * N)
     monkeypatch.setattr(route_tables, "run_method", run)
     return noted
 
@@ -72,13 +90,54 @@ def test_tuned_is_the_paper_with_the_best_of_the_swept_settings(asked: list) -> 
         assert (row["what"], row["method"], row["failures"]) == (what, "tuned", 0)
     both, narrow, quiet = (made.changes for made in asked)
     assert {made.method for made in asked} == {"paper"} and both == narrow | quiet
-    assert narrow == {"d_th_m": min(value for _, value in route_tables.SETTINGS["d_th [m]"])}
-    factor = min(value for _, value in route_tables.SETTINGS["noise"])
+    assert narrow == {"d_th_m": 0.25}
     usual = route_tables.settings_for("paper")
     assert (
-        quiet == pytest.approx({name: factor * getattr(usual.motion, name) for name in quiet})
+        quiet == pytest.approx({name: 0.2 * getattr(usual.motion, name) for name in quiet})
         and len(quiet) == 3
     )
+
+
+def test_each_cause_changes_one_thing_but_the_last_two(asked: list) -> None:
+    rows = route_tables.measure_causes("", "07", 0.47, 3)
+    assert [row["cause"] for row in rows] == list(route_tables.CAUSES)
+    assert {(row["fraction_1m"], row["seed"], row["method"]) for row in rows} == {(0.47, 3, "paper")}
+    usual = asked[0]
+    assert (usual.experiment.front_end.fraction_1m, usual.experiment.front_end.fraction_2m) == (0.47, 0.65)
+    n_changed = [
+        (made.changes != usual.changes)
+        + (made.experiment.front_end != usual.experiment.front_end)
+        + (not np.allclose(made.clouds, usual.clouds))
+        for made in asked
+    ]
+    assert n_changed == [0, *[1] * (len(asked) - 3), 2, 2]
+    assert not np.allclose(asked[-3].clouds, usual.clouds)  # the motion is left in the points
+
+
+def test_better_points_and_another_odometry_are_run_with_both_methods(asked: list) -> None:
+    rows = route_tables.measure_quality("", "07", 0.5, 2)
+    rows += route_tables.measure_odometry("", "07", "true", 0.5, 2)
+    assert [row["method"] for row in rows] == ["paper", "robust"] * 2 and rows[-1]["odometry"] == "true"
+    assert {made.experiment.front_end.fraction_2m for made in asked} == {0.67}
+    assert [made.experiment.session.odometry for made in asked] == ["rall"] * 2 + ["true"] * 2
+
+
+def test_a_row_is_also_judged_without_scans_of_faulty_ground_truth(asked: list) -> None:
+    route_tables.measure_registration("", "07", 1)
+    experiment, run = asked[0].experiment, route_tables.run_method(asked[0].experiment, "paper", [], 1)
+    shifted = replace(run, poses=run.poses + np.where(np.arange(N) < 3, 4.0, 0.0)[:, None] * (1.0, 0.0, 0.0))
+    row = route_tables.row_of(experiment, shifted, "paper", 1)
+    assert (row["n_faulty"], row["rmse_sound_m"]) == (0, row["rmse_m"]) and row["rmse_m"] > 1.0
+    marked = replace(experiment, session=replace(experiment.session, is_faulty=np.arange(N) < 3))
+    row = route_tables.row_of(marked, shifted, "paper", 1)
+    assert (row["n_faulty"], row["rmse_sound_m"]) == (3, 0.0) and row["rmse_m"] > 1.0
+
+
+def test_settings_are_swept_past_the_best_of_the_first_sweep(asked: list) -> None:
+    rows = route_tables.measure_settings("", "07", 0.4, 1)
+    swept = {name: [row["value"] for row in rows if row["what"] == name] for name in route_tables.SETTINGS}
+    assert min(swept["d_th [m]"]) < 0.25 and min(swept["noise"]) < 0.2 and max(swept["lambda"]) > 80
+    assert asked[-1].changes == pytest.approx({"forward_m": 1.0, "left_m": 0.6, "yaw_rad": np.deg2rad(2.0)})
 
 
 def test_registration_has_a_row_without_a_covariance(asked: list) -> None:
@@ -92,6 +151,17 @@ def test_registration_has_a_row_without_a_covariance(asked: list) -> None:
 def test_settings_are_not_judged_where_they_were_chosen() -> None:
     jobs = route_tables.list_tuned(["01", "02", "07"])
     assert {number for number, _, _ in jobs} == {"01", "07"} and len(set(jobs)) == len(jobs) == 18
+
+
+def test_sessions_are_those_of_the_paper_whatever_else_lies_there(tmp_path: Path) -> None:
+    for number in ("01", "02", "03", "07", "08", "10", "44"):
+        write_route(tmp_path, number, n=600)
+    jobs = route_tables.list_jobs(str(tmp_path))
+    assert {job[0] for job in jobs["seeds"]} == {"01", *route_tables.PAPER_SESSIONS}
+    assert {job[0] for job in jobs["quality"]} == set(route_tables.PAPER_SESSIONS)
+    assert all(set(job[:1]) <= set(route_tables.PAPER_SESSIONS) for job in jobs["kidnapped"] + jobs["causes"])
+    assert set(jobs) == set(route_tables.MEASURES)
+    assert all(isinstance(job[-1], int) for listed in jobs.values() for job in listed)  # the seed
 
 
 def test_a_kept_table_is_no_more_and_no_less_than_the_jobs() -> None:
@@ -113,10 +183,14 @@ def test_a_table_is_completed_and_nothing_is_measured_twice(
         return [{"session": number, "seed": seed, "rmse_m": 0.5 * seed}]
 
     monkeypatch.setitem(route_tables.MEASURES, "seeds", run)
+
+    def few(job: tuple) -> bool:
+        return job[-1] < 9
+
     path, files = tmp_path / "route_seeds.csv", {"real_root": "real", "weights": ""}
     with ThreadPoolExecutor(1) as pool:
         route_tables.run_table(pool, "seeds", [("07", 1)], path, **files)
-        route_tables.run_table(pool, "seeds", [("02", 3), ("07", 1)], path, **files)
+        route_tables.run_table(pool, "seeds", [("02", 3), ("07", 1), ("07", 9)], path, is_chosen=few, **files)
     assert measured == [("real", "07", 1), ("real", "02", 3)]
     table = pd.read_csv(path, dtype={"session": str})
     assert table.job.tolist() == ["02 3", "07 1"] and table.rmse_m.tolist() == [1.5, 0.5]
@@ -127,3 +201,23 @@ def test_a_table_is_completed_and_nothing_is_measured_twice(
     ):
         route_tables.run_table(pool, "seeds", [("07", 1)], path, **files)
     assert path.read_bytes() == before
+
+
+def test_stored_runs_carry_their_quality_and_odometry(tmp_path: Path) -> None:
+    assert len(route_tables.load_runs(tmp_path)) == 0 and len(route_tables.load_table(tmp_path, "seeds")) == 0
+    run = {"session": "02", "method": "paper", "seed": 1, "rmse_m": 1.0, "rmse_yaw_deg": 2.0, "failures": 1}
+    run |= {name: 0.5 for name in route_tables.CLASSES}
+    for what, more in (
+        ("seeds", [{"rmse_m": 3.0}, {"session": "10", "seed": 2, "failures": 2}]),
+        ("quality", [{"fraction_1m": 0.5}]),
+        ("odometry", [{"fraction_1m": 0.4, "odometry": "true"}]),
+    ):
+        pd.DataFrame([run | change for change in more]).to_csv(tmp_path / f"route_{what}.csv", index=False)
+    runs = route_tables.load_runs(tmp_path)
+    assert runs[["session", "fraction_1m", "odometry"]].to_numpy().tolist() == [
+        ["02", 0.4, "rall"], ["10", 0.4, "rall"], ["02", 0.5, "rall"], ["02", 0.4, "true"]
+    ]  # fmt: skip
+    groups = route_tables.summarize_runs(runs, ["fraction_1m", "odometry"])
+    row = groups.loc[(0.4, "rall")]
+    assert (row.n_runs, row.n_sessions, row.n_seeds) == (2, 2, 2) and row.failures == 1.5
+    assert (row.rmse_m, row.min_m, row.max_m, row.within_1m_2deg) == (2.0, 1.0, 3.0, 50.0)

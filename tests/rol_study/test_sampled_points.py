@@ -12,6 +12,7 @@ from rol_study.sampled_points import (
     FrontEnd,
     SampledPointsError,
     find_visible_points,
+    fraction_within_2m,
     sample_points,
     solve_mixture,
 )
@@ -121,3 +122,8 @@ def test_an_empty_or_invisible_map_is_refused() -> None:
                 np.random.default_rng(0),
             )
         )
+
+
+def test_points_near_the_map_are_as_real_front_ends_have_them() -> None:
+    assert [fraction_within_2m(value) for value in (0.40, 0.70, 1.0)] == [0.60, 0.80, 1.0]
+    assert abs(fraction_within_2m(0.80) - 0.85) < 0.03
