@@ -49,7 +49,13 @@ CHAPTERS = {
 LISTS, FOLDERS = ("sessions", "methods"), ("sessions_root", "out_dir", "book_dir")
 CONFIG_KEYS = {"profile", *LISTS, *FOLDERS, "seed", "notebooks", "simulated"}
 OPTIONAL_KEYS = {"real_root"}
-SHARED = ("sessions_root", "sessions", "out_dir", "seed", "real_root")  # keys that are parameters of notebooks
+SHARED = (
+    "sessions_root",
+    "sessions",
+    "out_dir",
+    "seed",
+    "real_root",
+)  # keys that are parameters of notebooks
 
 
 class ChapterError(ValueError):
