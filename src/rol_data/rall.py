@@ -60,8 +60,8 @@ class RealScan:
     twist: tuple[float, float, float] | None
 
 
-def find_real_root(given: str | Path = "") -> Path | None:
-    """Find the folder of the real data.
+def real_folder(given: str | Path = "") -> Path:
+    """Return the folder of the real data, whatever it holds.
 
     Parameters
     ----------
@@ -70,8 +70,8 @@ def find_real_root(given: str | Path = "") -> Path | None:
 
     Returns
     -------
-    root : Path or None
-        The folder, or None if it does not hold the lidar map.
+    root : Path
+        The folder; it may be missing.
 
     Raises
     ------
@@ -80,7 +80,23 @@ def find_real_root(given: str | Path = "") -> Path | None:
     """
     if given and not Path(given).is_dir():
         raise RallError(f"real_root: there is no folder {given}")
-    root = Path(given or os.environ.get("ROL_REAL_ROOT") or "data/real")
+    return Path(given or os.environ.get("ROL_REAL_ROOT") or "data/real")
+
+
+def find_real_root(given: str | Path = "") -> Path | None:
+    """Find the folder of the real data, if it holds the lidar map.
+
+    Parameters
+    ----------
+    given : path
+        As in `real_folder`, which may raise.
+
+    Returns
+    -------
+    root : Path or None
+        The folder, or None if it does not hold the lidar map.
+    """
+    root = real_folder(given)
     return root if (root / MAP_PATH).is_file() else None
 
 
