@@ -165,6 +165,7 @@ STEPS = {
         {"tables": found("data/paper/*.csv"), "measured": found("data/ablations/route_*.csv")},
         {},
     ),
+    "real_pairs": ("09_real_pairs", "real pairs", {"shipped": SHIPPED}, {}),
     "real_radar": ("10_real_radar", "real radar", {"weights": NETWORK, "shipped": SHIPPED}, {}),
     "ablations": (
         "11_ablations",
@@ -192,7 +193,7 @@ BEFORE = {  # commands that come before papermill
     )
 }
 # All others have 0. Those with -1 need no other chapter and fill gaps.
-PRIORITIES = {"real_vs_fake": 1, "oxford_route": -1, "ablations": -1, "performance": -1}
+PRIORITIES = {"real_vs_fake": 1, "oxford_route": -1, "real_pairs": -1, "ablations": -1, "performance": -1}
 
 
 rule book:

@@ -41,6 +41,7 @@ CHAPTERS = {
     "07_localization": "method",
     "08_results": "once",
     "09_oxford_route": "once",
+    "09_real_pairs": "once",
     "10_real_radar": "once",
     "11_ablations": "once",
     "12_performance": "once",

@@ -18,13 +18,13 @@ import numpy as np
 
 from rol.lidar import relate_sensors, sweep_to_radar
 from rol.oxford import (
-    ELEVATIONS_DOWN,
     EXTRINSICS,
     FIRE_HEIGHT,
     LIDARS,
     N_AZIMUTHS,
     N_BINS,
     N_HEADER,
+    N_LASERS,
     N_VELODYNE_ROWS,
     OxfordError,
     compose_odometry,
@@ -41,6 +41,7 @@ SWEEP_PATTERNS = ("**/[0-9]*.bin", "**/[0-9]*.png")
 TURN_US = 250_000  # of the radar
 MID_SCAN_US = 125_000  # from a scan's stamp to its middle, where no odometry gives it
 SWEEP_SECONDS = 0.05  # one turn of the lidar
+LASER_SPACING = 0.0232  # between the elevations of neighbouring lasers [rad]
 STAMP_DIGITS = 16  # of a stamp in microseconds, years 2001 to 2286
 
 
@@ -119,7 +120,9 @@ class RealPairs:
         return [min(sweeps, key=lambda sweep: abs(sweep.stamp_us - time_us)) for sweeps in own if sweeps]
 
     def _between(self, first_us: int, end_us: int) -> list[Sweep]:
-        first, end = (bisect_left(self.sweeps, t, key=lambda sweep: sweep.stamp_us) for t in (first_us, end_us))
+        first, end = (
+            bisect_left(self.sweeps, t, key=lambda sweep: sweep.stamp_us) for t in (first_us, end_us)
+        )
         return self.sweeps[first:end]
 
 
@@ -234,9 +237,8 @@ def sweep_start(points: np.ndarray) -> float:
     """
     clockwise = _clockwise(points)
     elevation = np.arctan2(points[:, 2] - FIRE_HEIGHT, np.hypot(points[:, 0], points[:, 1]))
-    laser = np.abs(elevation[:, None] + ELEVATIONS_DOWN).argmin(axis=1)
-    changes = np.flatnonzero(np.diff(laser)) + 1
-    if len(changes) > 4 * len(ELEVATIONS_DOWN):  # firing after firing
+    changes = np.flatnonzero(np.abs(np.diff(elevation)) > LASER_SPACING / 2.0) + 1
+    if len(changes) > 4 * N_LASERS:  # firing after firing
         return float(clockwise[0])
     first = clockwise[np.concatenate([[0], changes])]
     around = np.angle(np.exp(1j * (first - first[0])))
@@ -326,7 +328,10 @@ def _cover_faults(scans: dict[int, Path], is_paired: dict[int, bool], sweeps: np
         if not is_paired[stamp]:
             bare[path.parent].append(stamp)
     span = f"the sweeps span {sweeps[0]} to {sweeps[-1]}" if len(sweeps) else "there are no sweeps"
-    return [_count(folder, stamps, f"scans without a sweep inside their turn ({span})")[0] for folder, stamps in bare.items()]
+    return [
+        _count(folder, stamps, f"scans without a sweep inside their turn ({span})")[0]
+        for folder, stamps in bare.items()
+    ]
 
 
 def _count(path: Path, items: list, what: str) -> list[str]:

@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING
 import cv2
 import numpy as np
 import pandas as pd
-from scipy.ndimage import gaussian_filter, uniform_filter1d
-from scipy.optimize import minimize
+from scipy.ndimage import gaussian_filter, gaussian_filter1d, uniform_filter1d
+from scipy.optimize import least_squares, minimize
 from scipy.spatial import cKDTree
 
 from rol.bev import image_to_points, points_to_image
@@ -32,7 +32,7 @@ from rol.oxford import (
 from rol.pairs import PairSettings, radar_to_image
 from rol.radar import DOPPLER_SECONDS, MEASURED, SCAN_SECONDS, RangeCalibration, deskew_points
 from rol.similarity import fraction_within, nn_distances
-from rol_beyond.front_ends import DETECTORS, detect_points, generate_points
+from rol_beyond.front_ends import DETECTORS, detect_points, evaluate_on_map, generate_points
 from rol_data.oxford_pairs import PairedScan, RealPairs, Sweep, load_sweep_points, sweep_start
 from rol_study.misalignment import measure_misalignment
 
@@ -94,6 +94,16 @@ class Pair:
     def lidar_points(self) -> np.ndarray:
         """Centres of the occupied pixels, shape (m, 2) [m]."""
         return image_to_points(self.lidar_image, max_range=self.max_range)
+
+    @cached_property
+    def tops(self) -> np.ndarray:
+        """Height above the ground of the highest point in the pixel of each of the lidar points, shape (m,) [m]."""
+        height, forward, left = np.nan_to_num(fit_ground(self.cloud))
+        ground = (height or -2.0) + self.objects[:, :2] @ (forward, left)
+        _, pixel = cKDTree(self.lidar_points).query(self.objects[:, :2])
+        tops = np.full(len(self.lidar_points), -np.inf)
+        np.maximum.at(tops, pixel, self.objects[:, 2] - ground)
+        return tops
 
     @cached_property
     def radar_image(self) -> np.ndarray:
@@ -200,7 +210,7 @@ def compare_points(points: np.ndarray, lidar: np.ndarray) -> dict[str, float | i
     return scores
 
 
-def chance_level(points: np.ndarray, lidar: np.ndarray, n_turns: int = 12) -> dict[str, float]:
+def chance_level(points: np.ndarray, lidar: np.ndarray, n_turns: int = 8) -> dict[str, float]:
     """Compute the precision of points that are turned to wrong headings.
 
     Parameters
@@ -278,11 +288,15 @@ def locate_stamp(
     covariance = np.linalg.inv(columns.T @ columns) * (residual @ residual) / max(len(values) - 3, 1)
     own, following = weights[:2]
     slope = np.array([-following, own]) / (own + following) ** 2
-    return float(following / (own + following)), float(np.sqrt(slope @ covariance[:2, :2] @ slope)), len(values)
+    return (
+        float(following / (own + following)),
+        float(np.sqrt(slope @ covariance[:2, :2] @ slope)),
+        len(values),
+    )
 
 
 def sweep_consistency(
-    pairs: RealPairs, spans_s: Sequence[float], lag: int = 12, n_pairs: int = 12
+    pairs: RealPairs, spans_s: Sequence[float], lag: int = 12, n_pairs: int = 16
 ) -> np.ndarray:
     """Measure how well sweeps agree with later ones for several durations of a sweep.
 
@@ -312,20 +326,49 @@ def sweep_consistency(
     table = []
     for start in np.unique(np.linspace(0, len(sweeps) - lag - 1, n_pairs).astype(int)):
         two = [sweeps[start], sweeps[start + lag]]
-        loaded = [_walls(*load_sweep_points(sweep, span_s=1.0)) for sweep in two]
+        loaded = [_upright(*load_sweep_points(sweep, span_s=1.0)) for sweep in two]
         row = []
         for span in spans_s:
             clouds = [
                 _to_map(points, s.stamp_us + 1e6 * span * part, mids, poses)
                 for s, (points, part) in zip(two, loaded, strict=True)
             ]
-            distances = cKDTree(clouds[0]).query(clouds[1], distance_upper_bound=0.5)[0]
+            distances = cKDTree(clouds[0]).query(clouds[1][::3], distance_upper_bound=0.5)[0]
             row.append(float(np.minimum(distances, 0.5).mean()))
         table.append(row)
     return np.array(table)
 
 
-def _walls(points: np.ndarray, seconds: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def fit_span(
+    spans_s: Sequence[float], distances: np.ndarray, rng: np.random.Generator, n_resamples: int = 200
+) -> tuple[float, float]:
+    """Fit the duration of a sweep at which sweeps agree best.
+
+    Parameters
+    ----------
+    spans_s, distances : array, shape (s,) and (n, s)
+        As of `sweep_consistency`.
+    rng : numpy.random.Generator
+        Source of randomness of the bootstrap over pairs of sweeps.
+    n_resamples : int
+        Resamples of the bootstrap.
+
+    Returns
+    -------
+    span, error : float
+        Vertex of the parabola through the mean distances and its standard error [s]; nan without a minimum.
+    """
+
+    def vertex(rows: np.ndarray) -> float:
+        bend, slope, _ = np.polyfit(spans_s, rows.mean(axis=0), 2)
+        return -slope / (2.0 * bend) if bend > 0.0 else np.nan
+
+    n = len(distances)
+    again = [vertex(distances[rng.integers(0, n, n)]) for _ in range(n_resamples)]
+    return float(vertex(distances)), float(np.nanstd(again))
+
+
+def _upright(points: np.ndarray, seconds: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Keep points of upright things, where height does not matter, as 2D points with their times."""
     kept = (points[:, 2] > -0.5) & (points[:, 2] < 4.0) & (np.hypot(points[:, 0], points[:, 1]) < 30.0)
     return points[kept, :2], seconds[kept]
@@ -388,13 +431,18 @@ class RadarAgreement:
         Motion-compensated pairs.
     min_range, max_range : float
         Range of the lidar points used [m].
+    max_points : int
+        Most points of a scan, taken at a regular interval.
     """
 
-    def __init__(self, pairs: Sequence[Pair], min_range: float = 5.0, max_range: float = 50.0) -> None:
+    def __init__(
+        self, pairs: Sequence[Pair], min_range: float = 5.0, max_range: float = 50.0, max_points: int = 1500
+    ) -> None:
         self.images = [_sharpen_polar(pair.radar.power) for pair in pairs]
         self.azimuths = [pair.radar.azimuths for pair in pairs]
         self.twists = [pair.scan.twist for pair in pairs]
-        self.points = [crop_range(pair.lidar_points, max_range, min_range) for pair in pairs]
+        clouds = [crop_range(pair.lidar_points, max_range, min_range) for pair in pairs]
+        self.points = [cloud[:: len(cloud) // max_points + 1] for cloud in clouds]
 
     def scores(self, calibration: Calibration, sector_deg: tuple[float, float] = (0.0, 180.0)) -> np.ndarray:
         """Compute the mean sharpened power at the lidar points of every scan, shape (n,).
@@ -418,7 +466,10 @@ class RadarAgreement:
         return np.array(found)
 
     def fit(
-        self, names: Sequence[str], start: Calibration | None = None, sector_deg: tuple[float, float] = (0.0, 180.0)
+        self,
+        names: Sequence[str],
+        start: Calibration | None = None,
+        sector_deg: tuple[float, float] = (0.0, 180.0),
     ) -> tuple[Calibration, dict[str, float]]:
         """Find the calibration of the best agreement.
 
@@ -449,7 +500,9 @@ class RadarAgreement:
         n = len(names)
         simplex = np.vstack([np.zeros(n), np.eye(n)])
         options = {"initial_simplex": simplex, "xatol": 0.01, "fatol": 1e-4, "maxfev": 150 * n}
-        best = minimize(lambda x: -float(per_scan(x).mean()), np.zeros(n), method="Nelder-Mead", options=options).x
+        best = minimize(
+            lambda x: -float(per_scan(x).mean()), np.zeros(n), method="Nelder-Mead", options=options
+        ).x
         values = dict(zip(names, (origin + steps * best).tolist(), strict=True))
         errors = steps * _sandwich_errors(per_scan, best)
         return replace(start, **values), dict(zip(names, errors.tolist(), strict=True))
@@ -473,7 +526,9 @@ def _sandwich_errors(per_scan, best: np.ndarray, h: float = 0.5) -> np.ndarray:
 def _sharpen_polar(power: np.ndarray) -> np.ndarray:
     """Subtract the mean of 8 m along range and smooth by about the radar's own point spread."""
     values = power.astype(np.float32)
-    values = gaussian_filter(values - uniform_filter1d(values, 183, axis=1), (0.7, 3.0), mode=("wrap", "nearest"))
+    values = gaussian_filter(
+        values - uniform_filter1d(values, 183, axis=1), (0.7, 3.0), mode=("wrap", "nearest")
+    )
     return np.concatenate([values[-1:], values, values[:1]])
 
 
@@ -485,8 +540,10 @@ def _beam_at(
     moved = transform_points((c.forward_m, c.left_m, turn), points) + c.delay_s * np.asarray(twist[:2])
     n, step = len(azimuths), (azimuths[0] - azimuths[-1]) / (len(azimuths) - 1)
     seen = moved
-    for _ in range(3):
-        rows = np.mod(-np.arctan2(seen[:, 1], seen[:, 0]) + azimuths[0] + 0.5 * step, 2.0 * np.pi) / step - 0.5
+    for _ in range(2):
+        rows = (
+            np.mod(-np.arctan2(seen[:, 1], seen[:, 0]) + azimuths[0] + 0.5 * step, 2.0 * np.pi) / step - 0.5
+        )
         seconds = (rows / n - 0.5) * SCAN_SECONDS
         yaw = twist[2] * seconds
         d = moved - seconds[:, None] * np.asarray(twist[:2])
@@ -496,6 +553,119 @@ def _beam_at(
     ranges = ranges - c.doppler_s * (seen @ np.asarray(twist[:2])) / np.maximum(ranges, 1e-6)
     bins = (ranges - c.offset_m) / c.resolution_m - 0.5
     return (rows + 1.0).astype(np.float32), bins.astype(np.float32)
+
+
+def measure_walls(pairs: Sequence[Pair], calibration: Calibration) -> pd.DataFrame:
+    """Find walls that lidar and radar see in the same direction.
+
+    A wall is the first surface in the direction of a radar row, if its lidar points within 0.35 m of range span 1.5 m of
+    height or more. Its radar echo is the strongest one within 1.2 m.
+
+    Parameters
+    ----------
+    pairs : sequence of Pair
+        Motion-compensated pairs.
+    calibration : Calibration
+        The radar's geometry; its ranges serve to look for echoes only.
+
+    Returns
+    -------
+    walls : pandas.DataFrame
+        One row per wall and radar row: ``scan`` (number of the pair), ``range_m`` by the lidar, as the moving radar
+        would measure it with the Doppler shift, ``bin`` of the echo, ``aside`` (absolute sine of the bearing).
+    """
+    found = []
+    for number, pair in enumerate(pairs):
+        points = crop_range(pair.cloud, 50.0, 4.0)
+        points = points[(points[:, 2] > -1.0) & (points[:, 2] < 4.0)]
+        one_metre = replace(calibration, resolution_m=1.0, offset_m=-0.5)  # the bin is the range in metres
+        azimuths = pair.radar.azimuths
+        rows, ranges = _beam_at(points[:, :2], one_metre, azimuths, pair.scan.twist)
+        nearest = np.rint(rows - 1.0).astype(int) % len(azimuths)
+        smooth = gaussian_filter1d(pair.radar.power.astype(np.float32), 2.0, axis=1)
+        order = np.lexsort((ranges, nearest))
+        for part in np.split(order, np.flatnonzero(np.diff(nearest[order])) + 1):
+            row = nearest[part[0]]
+            first = part[ranges[part] < ranges[part[0]] + 0.35]
+            if len(first) < 5 or np.ptp(points[first, 2]) < 1.5:
+                continue
+            wall = float(np.median(ranges[first]))
+            echo = _find_echo(smooth[row], (wall - calibration.offset_m) / calibration.resolution_m - 0.5)
+            found.append((number, wall, echo, abs(np.sin(azimuths[row]))))
+    table = pd.DataFrame(found, columns=["scan", "range_m", "bin", "aside"])
+    return table[np.isfinite(table.bin)].reset_index(drop=True)
+
+
+def _find_echo(power: np.ndarray, middle: float, reach: int = 28, min_power: float = 70.0) -> float:
+    """Find the strongest echo near a bin, to a fraction of a bin; nan if it is weak or lies at the border."""
+    first = max(round(middle) - reach, 0)
+    part = power[first : first + 2 * reach + 1]
+    best = int(np.argmax(part))
+    if not 0 < best < len(part) - 1 or part[best] < min_power:
+        return np.nan
+    left, top, right = part[best - 1 : best + 2]
+    bend = left - 2.0 * top + right
+    return first + best + (0.5 * (left - right) / bend if bend < 0.0 else 0.0)
+
+
+def fit_ranges(walls: pd.DataFrame) -> tuple[np.ndarray, np.ndarray]:
+    """Fit length of a bin and offset of the radar's ranges to walls.
+
+    Parameters
+    ----------
+    walls : pandas.DataFrame
+        As of `measure_walls`.
+
+    Returns
+    -------
+    values, errors : array, shape (2,)
+        Resolution and offset [m], and their standard errors by leaving out one scan at a time.
+    """
+
+    def fit(table: pd.DataFrame) -> np.ndarray:
+        def residuals(x: np.ndarray) -> np.ndarray:
+            return (table.bin + 0.5) * x[0] + x[1] - table.range_m
+
+        start = [MEASURED.resolution_m, MEASURED.offset_m]
+        return least_squares(residuals, start, loss="soft_l1", f_scale=0.1, x_scale=(1e-4, 0.1)).x
+
+    scans = walls.scan.unique()
+    others = (
+        np.array([fit(walls[walls.scan != scan]) for scan in scans])
+        if len(scans) > 1
+        else np.full((1, 2), np.nan)
+    )
+    errors = np.sqrt((len(scans) - 1) * ((others - others.mean(axis=0)) ** 2).mean(axis=0))
+    return fit(walls), errors
+
+
+def calibrate(pairs: Sequence[Pair]) -> tuple[pd.DataFrame, pd.DataFrame]:
+    """Calibrate the radar against the lidar: rotation and shift, delay and Doppler constant, ranges.
+
+    Parameters
+    ----------
+    pairs : sequence of Pair
+        Motion-compensated pairs.
+
+    Returns
+    -------
+    table : pandas.DataFrame
+        Columns ``value`` and ``error`` (standard error) of ``rotation_deg``, ``forward_m``, ``left_m`` (fitted together),
+        ``delay_ms``, ``doppler_s`` (fitted together with a rotation and a shift to the left), ``resolution_m`` and
+        ``offset_m`` (fitted to the walls).
+    walls : pandas.DataFrame
+        As of `measure_walls`.
+    """
+    agreement = RadarAgreement(pairs)
+    placed, placed_errors = agreement.fit(["rotation_deg", "forward_m", "left_m"])
+    timed, timed_errors = agreement.fit(["rotation_deg", "left_m", "delay_s", "doppler_s"])
+    walls = measure_walls(pairs, placed)
+    ranges, range_errors = fit_ranges(walls)
+    rows = {name: (getattr(placed, name), error) for name, error in placed_errors.items()}
+    rows["delay_ms"] = 1e3 * timed.delay_s, 1e3 * timed_errors["delay_s"]
+    rows["doppler_s"] = timed.doppler_s, timed_errors["doppler_s"]
+    rows |= dict(zip(("resolution_m", "offset_m"), zip(ranges, range_errors, strict=True), strict=True))
+    return pd.DataFrame(rows, index=["value", "error"]).T, walls
 
 
 # ---- ground ----
@@ -535,7 +705,7 @@ def fit_ground(cloud: np.ndarray, radius_m: float = 25.0, near: float = 0.5) -> 
 # ---- kinds of points ----
 
 
-def distance_from_path(points: np.ndarray, scan: PairedScan, poses: np.ndarray | None) -> np.ndarray:
+def distance_from_path(points: np.ndarray, scan: PairedScan, path: np.ndarray | None) -> np.ndarray:
     """Compute the distance of points from the path of the vehicle.
 
     Parameters
@@ -544,21 +714,24 @@ def distance_from_path(points: np.ndarray, scan: PairedScan, poses: np.ndarray |
         Points in the radar frame of a scan [m].
     scan : PairedScan
         The scan.
-    poses : array, shape (m, 3), or None
-        Path in the frame of ``scan.pose``; None takes a straight line through the radar.
+    path : array, shape (m, 3), or None
+        Poses in the frame of ``scan.pose`` [m, m, rad], continued straight on for 80 m at both ends; without it the
+        path is a straight line through the radar.
 
     Returns
     -------
     distances : array, shape (n,)
         Distances [m].
     """
-    line = np.column_stack([np.arange(-80.0, 80.5, 0.5), np.zeros(321)])
-    if poses is not None and scan.pose is not None:
-        own = relative_pose(np.broadcast_to(scan.pose, poses.shape), poses)[:, :2]
-        own = own[np.hypot(own[:, 0], own[:, 1]) < 90.0]
-        ends = [own[-1] + d * np.array([1.0, 0.0]) for d in np.arange(0.5, 80.0, 0.5)] if len(own) else []
-        line = np.vstack([own, ends]) if len(own) else line
-    return cKDTree(line).query(points)[0]
+    own = np.zeros((1, 3))
+    if path is not None and scan.pose is not None:
+        own = relative_pose(np.broadcast_to(scan.pose, path.shape), path)
+    ahead = np.arange(0.25, 80.0, 0.25)
+    ends = [
+        pose[:2] + sign * ahead[:, None] * (np.cos(pose[2]), np.sin(pose[2]))
+        for pose, sign in ((own[0], -1.0), (own[-1], 1.0))
+    ]
+    return cKDTree(np.vstack([*ends, own[:, :2]])).query(points)[0]
 
 
 def describe_points(points: np.ndarray, pair: Pair, path: np.ndarray | None = None) -> pd.DataFrame:
@@ -584,32 +757,108 @@ def describe_points(points: np.ndarray, pair: Pair, path: np.ndarray | None = No
     return pd.DataFrame(
         {
             "distance_m": distances,
-            "top_m": object_tops(pair)[nearest],
+            "top_m": pair.tops[nearest],
             "from_path_m": distance_from_path(points, pair.scan, path),
             "is_hidden": np.hypot(*points.T) > _first_ranges(points, pair.lidar_points) + 1.0,
         }
     )
 
 
-def object_tops(pair: Pair) -> np.ndarray:
-    """Compute the height above the ground of the highest point in each lidar pixel, shape (m,) [m]."""
-    height, forward, left = fit_ground(pair.cloud)
-    ground = np.nan_to_num(height, nan=-2.0) + np.nan_to_num([forward, left]) @ pair.objects[:, :2].T
-    tops = np.full(len(pair.lidar_points), -np.inf)
-    _, pixel = cKDTree(pair.lidar_points).query(pair.objects[:, :2])
-    np.maximum.at(tops, pixel, pair.objects[:, 2] - ground)
-    return tops
-
-
 def _first_ranges(points: np.ndarray, lidar: np.ndarray, n_sectors: int = 360) -> np.ndarray:
     """Find the range of the nearest lidar point in the direction of each point; infinite without one [m]."""
     sector, own = (
-        (np.mod(np.arctan2(p[:, 1], p[:, 0]), 2.0 * np.pi) / (2.0 * np.pi) * n_sectors).astype(int) % n_sectors
+        (np.mod(np.arctan2(p[:, 1], p[:, 0]), 2.0 * np.pi) / (2.0 * np.pi) * n_sectors).astype(int)
+        % n_sectors
         for p in (lidar, points)
     )
     first = np.full(n_sectors, np.inf)
     np.minimum.at(first, sector, np.hypot(*lidar.T))
     return first[own]
+
+
+def tabulate_kinds(
+    pairs: Sequence[Pair], points: Sequence[Mapping[str, np.ndarray]], path: np.ndarray | None = None
+) -> pd.DataFrame:
+    """Tabulate where the points of front ends lie, which are right, and what the lidar has where they are wrong.
+
+    Parameters
+    ----------
+    pairs : sequence of Pair
+        The pairs.
+    points : sequence of mapping
+        Of each pair: front end -> points, shape (n, 2) [m].
+    path : array, shape (m, 3), optional
+        Path of the vehicle, see `distance_from_path`.
+
+    Returns
+    -------
+    table : pandas.DataFrame
+        One row per front end, percentages over all pairs: of ``points`` by distance from the path; of these
+        ``within 1 m`` of a lidar point; of the ``lidar points reached`` within 1 m, by the height of the highest in the
+        pixel; and of points ``over 2 m off``, all and those in view, see `describe_points`.
+    """
+    found, lidar = [], []
+    for pair, clouds in zip(pairs, points, strict=True):
+        for name, cloud in clouds.items():
+            found.append(describe_points(cloud, pair, path).assign(front_end=name))
+            near = nn_distances(pair.lidar_points, cloud) < 1.0
+            lidar.append(pd.DataFrame({"front_end": name, "top_m": pair.tops, "near": near}))
+    kinds, reach = pd.concat(found), pd.concat(lidar)
+    zone = pd.cut(
+        kinds.from_path_m, [0, 4, 10, np.inf], labels=["0-4 m", "4-10 m", "beyond"], include_lowest=True
+    )
+    height = pd.cut(reach.top_m, [-np.inf, 1.0, 2.5, np.inf], labels=["below 1 m", "1-2.5 m", "higher"])
+    is_off = kinds.distance_m >= 2.0
+    kinds = kinds.assign(
+        zone=zone, right=kinds.distance_m < 1.0, all=is_off, in_view=is_off & ~kinds.is_hidden
+    )
+    own = kinds.groupby("front_end", sort=False)
+    by_zone = kinds.groupby(["front_end", "zone"], sort=False, observed=False)
+    by_height = reach.assign(height=height).groupby(["front_end", "height"], sort=False, observed=False)
+    parts = {
+        "points": by_zone.size().unstack().div(own.size(), axis=0),
+        "within 1 m": by_zone.right.mean().unstack(),
+        "lidar points reached": by_height.near.mean().unstack(),
+        "over 2 m off": own[["all", "in_view"]].mean(),
+    }
+    return 100.0 * pd.concat(parts, axis=1)
+
+
+def tabulate_on_map(
+    pairs: Sequence[Mapping[tuple[str, str], Pair]],
+    points: Sequence[Mapping[str, np.ndarray]],
+    poses: Mapping[int, np.ndarray],
+    map_tree: cKDTree,
+) -> pd.DataFrame:
+    """Compute the precision of lidar points and of front ends on a map.
+
+    Parameters
+    ----------
+    pairs : sequence of mapping
+        Of each scan: what `load_scan_pairs` returns.
+    points : sequence of mapping
+        Of each scan: front end -> motion-compensated points, shape (n, 2) [m].
+    poses : mapping
+        Stamp of a scan [us] -> its pose on the map; scans without one are left out.
+    map_tree : scipy.spatial.cKDTree
+        Tree of the map's points [m].
+
+    Returns
+    -------
+    table : pandas.DataFrame
+        Rows "lidar, nearest", "lidar, turn" and the front ends: ``share_1m`` and ``share_2m`` (0..1) and ``n`` points,
+        means over scans. Empty without a scan on the map.
+    """
+    rows = []
+    for of_scan, clouds in zip(pairs, points, strict=True):
+        own = {sweeps: of_scan[motion, sweeps] for motion, sweeps in of_scan if motion == "compensated"}
+        stamps = {pair.scan.stamp_us for pair in own.values()} & set(poses)
+        of_lidar = {f"lidar, {sweeps}": pair.lidar_points for sweeps, pair in own.items()}
+        for stamp in stamps:
+            for name, cloud in {**of_lidar, **clouds}.items():
+                rows.append({"points": name, **evaluate_on_map(cloud, poses[stamp], map_tree)})
+    table = pd.DataFrame(rows, columns=["points", "share_1m", "share_2m", "n"])
+    return table.groupby("points", sort=False).mean()
 
 
 # ---- front ends ----
@@ -664,7 +913,12 @@ def tabulate(pair: Pair, points: Mapping[str, np.ndarray]) -> list[dict[str, obj
     forward, left = pair.misalignment
     rows = []
     for name, cloud in points.items():
-        row = {"timestamp_us": pair.scan.stamp_us, "front_end": name, "motion": pair.motion, "sweeps": pair.sweeps}
+        row = {
+            "timestamp_us": pair.scan.stamp_us,
+            "front_end": name,
+            "motion": pair.motion,
+            "sweeps": pair.sweeps,
+        }
         row |= compare_points(cloud, pair.lidar_points)
         rows.append(row | {"misalignment_forward_m": forward, "misalignment_left_m": left})
     return rows

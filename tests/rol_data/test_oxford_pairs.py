@@ -60,7 +60,13 @@ def test_scans_and_sweeps_of_different_folders_are_paired(tree: Path) -> None:
     pairs = find_pairs(tree)
     assert [scan.stamp_us - START for scan in pairs.scans] == [0, 250_000]
     assert {sweep.lidar for sweep in pairs.sweeps} == {"velodyne_left"} and pairs.faults == []
-    assert [s.stamp_us - START for s in pairs.turn(pairs.scans[0])] == [10_000, 60_000, 110_000, 160_000, 210_000]
+    assert [s.stamp_us - START for s in pairs.turn(pairs.scans[0])] == [
+        10_000,
+        60_000,
+        110_000,
+        160_000,
+        210_000,
+    ]
     assert [s.stamp_us - START for s in pairs.turn(pairs.scans[1])] == [260_000]
     assert [s.stamp_us - START for s in pairs.nearest(START + 125_000)] == [110_000]
     assert pairs.nearest(START + 400_000) == []
@@ -76,7 +82,9 @@ def test_only_the_given_places_are_searched(tree: Path) -> None:
 def test_a_session_with_two_lidars_is_found_in_its_own_layout(tree: Path) -> None:
     shutil.move(tree / "two/data/binaries", tree / "one/velodyne_left")
     (tree / "two/data/velodyne_left.timestamps").rename(tree / "one/velodyne_left.timestamps")
-    shutil.copytree(tree / "one/velodyne_left", tree / "one/velodyne_right")  # without a list: all files count
+    shutil.copytree(
+        tree / "one/velodyne_left", tree / "one/velodyne_right"
+    )  # without a list: all files count
     pairs = find_pairs(tree)
     assert [sweep.lidar for sweep in pairs.nearest(START)] == ["velodyne_left", "velodyne_right"]
     assert len(pairs.turn(pairs.scans[0])) == 10 and pairs.faults == []

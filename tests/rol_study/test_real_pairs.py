@@ -24,7 +24,6 @@ from rol_study.real_pairs import (
     load_scan_pairs,
     locate_stamp,
     measure_stamps,
-    object_tops,
     tabulate,
 )
 
@@ -95,7 +94,7 @@ def test_points_are_described_by_what_the_lidar_has_around_them() -> None:
     hedge = np.column_stack([np.arange(5.0, 9.0, 0.2), np.full(20, -6.1)])
     cloud = np.vstack([lift(street, -2.0), lift(wall, 3.0), lift(wall, -1.0), lift(hedge, -1.2)])
     pair = make_pair(cloud)
-    tops = object_tops(pair)
+    tops = pair.tops
     is_wall = pair.lidar_points[:, 1] > 0
     assert np.allclose(tops[is_wall], 5.0, atol=0.1) and np.allclose(tops[~is_wall], 0.8, atol=0.1)
     points = np.array([[0.0, 8.0], [7.0, -6.0], [1.0, 16.0], [10.0, 0.0]])

@@ -440,9 +440,9 @@ def test_smoke_profile_plans_every_run(workplace: Path) -> None:
         "ground_removal": "5",
         "generated_images": "5",
         "localization": "4",
-        "total": "34",
+        "total": "35",
         **dict.fromkeys(("book", "sessions", "pix2pix", "real_vs_fake", "ground_truth", "results"), "1"),
-        **dict.fromkeys(("oxford_route", "real_radar", "ablations", "performance"), "1"),
+        **dict.fromkeys(("oxford_route", "real_pairs", "real_radar", "ablations", "performance"), "1"),
     }
 
 
