@@ -12,6 +12,7 @@ from bisect import bisect_left
 from collections import defaultdict
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from glob import glob
 from pathlib import Path
 
 import numpy as np
@@ -138,7 +139,7 @@ def find_pairs(
     real_root : path
         Folder to look in.
     scan_patterns, sweep_patterns : sequence of str
-        Where to look for the files below it, as patterns of `pathlib.Path.glob`; everywhere if not given.
+        Where to look for the files below it, as patterns of `glob.glob`; everywhere but in hidden folders if not given.
 
     Returns
     -------
@@ -154,10 +155,10 @@ def find_pairs(
         If a list of stamps or an odometry is at fault; the message names file and fault.
     """
     root = Path(real_root)
-    found = {path for pattern in scan_patterns for path in root.glob(pattern) if _is_frame(path)}
-    scan_files = _first_of_stamp(path for path in found if _png_size(path) == (N_AZIMUTHS, N_HEADER + N_BINS))
-    found = {path for pattern in sweep_patterns for path in root.glob(pattern) if _is_frame(path)}
-    files = sorted(p for p in found if p.suffix == ".bin" or _png_size(p)[0] == N_VELODYNE_ROWS)
+    size = (N_AZIMUTHS, N_HEADER + N_BINS)
+    scan_files = _first_of_stamp(p for p in _find_frames(root, scan_patterns) if _png_size(p) == size)
+    files = _find_frames(root, sweep_patterns)
+    files = [path for path in files if path.suffix == ".bin" or _png_size(path)[0] == N_VELODYNE_ROWS]
     sweeps, faults = _assign_sweeps(files, root)
     stamps = np.array([sweep.stamp_us for sweep in sweeps], dtype=np.int64)
     is_paired = {stamp: _has_any(stamps, stamp, stamp + TURN_US) for stamp in scan_files}
@@ -252,8 +253,11 @@ def _clockwise(points: np.ndarray) -> np.ndarray:
     return -np.arctan2(points[:, 1], points[:, 0]).astype(np.float64)
 
 
-def _is_frame(path: Path) -> bool:
-    return path.stem.isdecimal() and len(path.stem) == STAMP_DIGITS and path.is_file()
+def _find_frames(root: Path, patterns: Sequence[str]) -> list[Path]:
+    """List the files that patterns match and whose names are stamps; folders that are links are searched as well."""
+    names = {name for pattern in patterns for name in glob(pattern, root_dir=root, recursive=True)}
+    paths = sorted(root / name for name in names)
+    return [p for p in paths if p.stem.isdecimal() and len(p.stem) == STAMP_DIGITS and p.is_file()]
 
 
 def _png_size(path: Path) -> tuple[int, int]:

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import cv2
@@ -273,7 +274,7 @@ def locate_stamp(
     Returns
     -------
     place : float
-        0 for the beginning, 1 for the end.
+        0 for the beginning, 1 for the end; nan if the sweeps are all of one length.
     error : float
         Its standard error.
     n : int
@@ -283,6 +284,8 @@ def locate_stamp(
     used = is_good[:-1] & is_good[1:]
     columns = np.column_stack([turned_deg[:-1], turned_deg[1:], np.ones(len(turned_deg) - 1)])[used]
     values = intervals_ms[:-1][used]
+    if np.linalg.matrix_rank(columns) < 3:
+        return float("nan"), float("nan"), len(values)
     weights, *_ = np.linalg.lstsq(columns, values, rcond=None)
     residual = values - columns @ weights
     covariance = np.linalg.inv(columns.T @ columns) * (residual @ residual) / max(len(values) - 3, 1)
@@ -296,7 +299,11 @@ def locate_stamp(
 
 
 def sweep_consistency(
-    pairs: RealPairs, spans_s: Sequence[float], lag: int = 12, n_pairs: int = 16
+    sweeps: Sequence[Sweep],
+    odometry_path: Path | str,
+    spans_s: Sequence[float],
+    lag: int = 12,
+    n_pairs: int = 16,
 ) -> np.ndarray:
     """Measure how well sweeps agree with later ones for several durations of a sweep.
 
@@ -304,8 +311,10 @@ def sweep_consistency(
 
     Parameters
     ----------
-    pairs : RealPairs
-        What was found; the odometry of its first scan is used.
+    sweeps : sequence of Sweep
+        Consecutive sweeps of one lidar, .bin files.
+    odometry_path : path
+        Odometry of the radar; sweeps outside its span are left out.
     spans_s : sequence of float
         Durations to try: 0.05 for a turn with the stamp at its beginning, 0 for all points at once, -0.05 for points
         fired the other way round [s].
@@ -317,15 +326,15 @@ def sweep_consistency(
     Returns
     -------
     distances : array, shape (n_pairs, s)
-        Mean distance of the later sweep's points to the earlier one's, each limited to 0.5 m [m].
+        Mean distance of the later sweep's points to the earlier one's, each limited to 0.5 m [m]; no row with too few
+        sweeps.
     """
-    first = next(scan for scan in pairs.scans if scan.odometry_path is not None)
-    _, mids, poses = compose_odometry(load_radar_odometry(first.odometry_path))
-    sweeps = [s for s in pairs.sweeps if s.path.suffix == ".bin" and s.lidar == pairs.sweeps[0].lidar]
-    sweeps = [s for s in sweeps if mids[0] < s.stamp_us < mids[-1] - 100_000]
+    _, mids, poses = compose_odometry(load_radar_odometry(odometry_path))
+    kept = [s for s in sweeps if mids[0] < s.stamp_us < mids[-1] - 100_000]
+    starts = np.linspace(0, max(len(kept) - lag - 1, 0), n_pairs).astype(int)
     table = []
-    for start in np.unique(np.linspace(0, len(sweeps) - lag - 1, n_pairs).astype(int)):
-        two = [sweeps[start], sweeps[start + lag]]
+    for start in np.unique(starts) if len(kept) > lag else ():
+        two = [kept[start], kept[start + lag]]
         loaded = [_upright(*load_sweep_points(sweep, span_s=1.0)) for sweep in two]
         row = []
         for span in spans_s:
@@ -336,7 +345,7 @@ def sweep_consistency(
             distances = cKDTree(clouds[0]).query(clouds[1][::3], distance_upper_bound=0.5)[0]
             row.append(float(np.minimum(distances, 0.5).mean()))
         table.append(row)
-    return np.array(table)
+    return np.array(table).reshape(-1, len(spans_s))
 
 
 def fit_span(
@@ -358,6 +367,8 @@ def fit_span(
     span, error : float
         Vertex of the parabola through the mean distances and its standard error [s]; nan without a minimum.
     """
+    if len(distances) < 2:
+        return float("nan"), float("nan")
 
     def vertex(rows: np.ndarray) -> float:
         bend, slope, _ = np.polyfit(spans_s, rows.mean(axis=0), 2)
@@ -428,7 +439,7 @@ class RadarAgreement:
     Parameters
     ----------
     pairs : sequence of Pair
-        Motion-compensated pairs.
+        Motion-compensated pairs; those without lidar points in the range are left out.
     min_range, max_range : float
         Range of the lidar points used [m].
     max_points : int
@@ -438,38 +449,32 @@ class RadarAgreement:
     def __init__(
         self, pairs: Sequence[Pair], min_range: float = 5.0, max_range: float = 50.0, max_points: int = 1500
     ) -> None:
+        clouds = [crop_range(pair.lidar_points, max_range, min_range) for pair in pairs]
+        self.points = [cloud[:: len(cloud) // max_points + 1] for cloud in clouds if len(cloud)]
+        pairs = [pair for pair, cloud in zip(pairs, clouds, strict=True) if len(cloud)]
         self.images = [_sharpen_polar(pair.radar.power) for pair in pairs]
         self.azimuths = [pair.radar.azimuths for pair in pairs]
         self.twists = [pair.scan.twist for pair in pairs]
-        clouds = [crop_range(pair.lidar_points, max_range, min_range) for pair in pairs]
-        self.points = [cloud[:: len(cloud) // max_points + 1] for cloud in clouds]
 
-    def scores(self, calibration: Calibration, sector_deg: tuple[float, float] = (0.0, 180.0)) -> np.ndarray:
+    def scores(self, calibration: Calibration) -> np.ndarray:
         """Compute the mean sharpened power at the lidar points of every scan, shape (n,).
 
         Parameters
         ----------
         calibration : Calibration
             The radar's geometry.
-        sector_deg : tuple of float
-            Only points whose direction deviates from straight ahead by an angle in this range [deg].
         """
         found = []
         for image, azimuths, twist, points in zip(
             self.images, self.azimuths, self.twists, self.points, strict=True
         ):
-            aside = np.abs(np.rad2deg(np.arctan2(points[:, 1], points[:, 0])))
-            used = points[(aside >= sector_deg[0]) & (aside <= sector_deg[1])]
-            rows, bins = _beam_at(used, calibration, azimuths, twist)
+            rows, bins = _beam_at(points, calibration, azimuths, twist)
             values = cv2.remap(image, bins[:, None], rows[:, None], cv2.INTER_LINEAR)
-            found.append(float(values.mean()) if len(used) else np.nan)
+            found.append(float(values.mean()))
         return np.array(found)
 
     def fit(
-        self,
-        names: Sequence[str],
-        start: Calibration | None = None,
-        sector_deg: tuple[float, float] = (0.0, 180.0),
+        self, names: Sequence[str], start: Calibration | None = None
     ) -> tuple[Calibration, dict[str, float]]:
         """Find the calibration of the best agreement.
 
@@ -479,23 +484,23 @@ class RadarAgreement:
             Fields of `Calibration` to estimate; the others stay as in `start`.
         start : Calibration, optional
             Where to begin.
-        sector_deg : tuple of float
-            As in `scores`.
 
         Returns
         -------
         calibration : Calibration
-            The best one.
+            The best one; nan without any lidar point in range.
         errors : dict
             Standard error of each field estimated, from the spread of the scans' gradients (scans taken as
             independent, which neighbours in one street are not).
         """
+        if not self.points:
+            return Calibration(*[np.nan] * 7), dict.fromkeys(names, np.nan)
         start, steps = start or Calibration(), np.array([STEPS[name] for name in names])
         origin = np.array([getattr(start, name) for name in names])
 
         def per_scan(x: np.ndarray) -> np.ndarray:
             values = dict(zip(names, (origin + steps * x).tolist(), strict=True))
-            return self.scores(replace(start, **values), sector_deg)
+            return self.scores(replace(start, **values))
 
         n = len(names)
         simplex = np.vstack([np.zeros(n), np.eye(n)])
@@ -619,7 +624,8 @@ def fit_ranges(walls: pd.DataFrame) -> tuple[np.ndarray, np.ndarray]:
     Returns
     -------
     values, errors : array, shape (2,)
-        Resolution and offset [m], and their standard errors by leaving out one scan at a time.
+        Resolution and offset [m], and their standard errors by leaving out one scan at a time; nan with fewer than
+        20 walls.
     """
 
     def fit(table: pd.DataFrame) -> np.ndarray:
@@ -629,6 +635,8 @@ def fit_ranges(walls: pd.DataFrame) -> tuple[np.ndarray, np.ndarray]:
         start = [MEASURED.resolution_m, MEASURED.offset_m]
         return least_squares(residuals, start, loss="soft_l1", f_scale=0.1, x_scale=(1e-4, 0.1)).x
 
+    if len(walls) < 20:
+        return np.full(2, np.nan), np.full(2, np.nan)
     scans = walls.scan.unique()
     others = (
         np.array([fit(walls[walls.scan != scan]) for scan in scans])
@@ -651,20 +659,28 @@ def calibrate(pairs: Sequence[Pair]) -> tuple[pd.DataFrame, pd.DataFrame]:
     -------
     table : pandas.DataFrame
         Columns ``value`` and ``error`` (standard error) of ``rotation_deg``, ``forward_m``, ``left_m`` (fitted together),
-        ``delay_ms``, ``doppler_s`` (fitted together with a rotation and a shift to the left), ``resolution_m`` and
-        ``offset_m`` (fitted to the walls).
+        the rotation by points near and far from the radar alone, ``delay_ms``, ``doppler_s`` (fitted together with a
+        rotation and a shift to the left), ``resolution_m`` and ``offset_m`` (fitted to the walls), and the offset with
+        that resolution by walls beside, and ahead or behind, alone.
     walls : pandas.DataFrame
         As of `measure_walls`.
     """
     agreement = RadarAgreement(pairs)
-    placed, placed_errors = agreement.fit(["rotation_deg", "forward_m", "left_m"])
-    timed, timed_errors = agreement.fit(["rotation_deg", "left_m", "delay_s", "doppler_s"])
+    placed, errors = agreement.fit(["rotation_deg", "forward_m", "left_m"])
+    rows = {name: (getattr(placed, name), error) for name, error in errors.items()}
+    for limits in ((5.0, 20.0), (20.0, 50.0)):
+        ring, errors = RadarAgreement(pairs, *limits).fit(["rotation_deg"], placed)
+        rows["rotation_deg, {:.0f} to {:.0f} m".format(*limits)] = ring.rotation_deg, errors["rotation_deg"]
+    timed, errors = agreement.fit(["rotation_deg", "left_m", "delay_s", "doppler_s"])
+    rows["delay_ms"] = 1e3 * timed.delay_s, 1e3 * errors["delay_s"]
+    rows["doppler_s"] = timed.doppler_s, errors["doppler_s"]
     walls = measure_walls(pairs, placed)
     ranges, range_errors = fit_ranges(walls)
-    rows = {name: (getattr(placed, name), error) for name, error in placed_errors.items()}
-    rows["delay_ms"] = 1e3 * timed.delay_s, 1e3 * timed_errors["delay_s"]
-    rows["doppler_s"] = timed.doppler_s, timed_errors["doppler_s"]
     rows |= dict(zip(("resolution_m", "offset_m"), zip(ranges, range_errors, strict=True), strict=True))
+    offsets = walls.range_m - (walls.bin + 0.5) * ranges[0]
+    for name, is_there in {"beside": walls.aside > 0.8, "ahead or behind": walls.aside < 0.6}.items():
+        by_scan = offsets[is_there].groupby(walls.scan[is_there]).median()
+        rows[f"offset_m, walls {name}"] = offsets[is_there].median(), by_scan.sem()
     return pd.DataFrame(rows, index=["value", "error"]).T, walls
 
 
@@ -754,10 +770,11 @@ def describe_points(points: np.ndarray, pair: Pair, path: np.ndarray | None = No
         direction, where the lidar cannot confirm or refute it.
     """
     distances, nearest = cKDTree(pair.lidar_points).query(points)
+    tops = np.append(pair.tops, np.nan)  # the last one for points without any lidar point
     return pd.DataFrame(
         {
             "distance_m": distances,
-            "top_m": pair.tops[nearest],
+            "top_m": tops[nearest],
             "from_path_m": distance_from_path(points, pair.scan, path),
             "is_hidden": np.hypot(*points.T) > _first_ranges(points, pair.lidar_points) + 1.0,
         }

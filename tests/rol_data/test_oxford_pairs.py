@@ -79,6 +79,13 @@ def test_only_the_given_places_are_searched(tree: Path) -> None:
     assert find_pairs(tree, ("two/**/*.png",)).scans == []
 
 
+def test_folders_that_are_links_are_searched(tree: Path, tmp_path_factory: pytest.TempPathFactory) -> None:
+    root = tmp_path_factory.mktemp("links")
+    (root / "scans").symlink_to(tree / "one")
+    (root / "sweeps").symlink_to(tree / "two")
+    assert len(find_pairs(root).scans) == 2
+
+
 def test_a_session_with_two_lidars_is_found_in_its_own_layout(tree: Path) -> None:
     shutil.move(tree / "two/data/binaries", tree / "one/velodyne_left")
     (tree / "two/data/velodyne_left.timestamps").rename(tree / "one/velodyne_left.timestamps")
