@@ -5,11 +5,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 
 from rol.geometry import transform_points
-from rol.oxford import RadarScan
+from rol.lidar import relate_sensors
+from rol.oxford import EXTRINSICS, FIRE_HEIGHT, RadarOdometry, RadarScan
 from rol.radar import MEASURED, ScanMotion, peaks_to_points
-from rol_data.oxford_pairs import PairedScan, find_pairs
+from rol_data.oxford_pairs import PairedScan, Sweep, find_pairs
+from rol_sim.session.oxford_files import save_radar_odometry, save_velodyne_binary
 from rol_study.real_pairs import (
     COLUMNS,
     Calibration,
@@ -20,11 +23,17 @@ from rol_study.real_pairs import (
     describe_points,
     distance_from_path,
     fit_ground,
+    fit_ranges,
+    fit_span,
     load_path,
     load_scan_pairs,
     locate_stamp,
     measure_stamps,
+    measure_walls,
+    sweep_consistency,
     tabulate,
+    tabulate_kinds,
+    tabulate_on_map,
 )
 
 TWIST = (8.0, 0.0, 0.0)
@@ -79,6 +88,62 @@ def test_calibration_that_made_a_scan_is_found() -> None:
     assert agreement.scores(Calibration()) > agreement.scores(replace(Calibration(), left_m=0.6))
 
 
+def test_ranges_are_fitted_to_walls() -> None:
+    pairs = []
+    for first in (6.0, 7.0, 8.0):
+        bins = np.rint((np.linspace(first, 40.0, 400) + 0.4) / 0.0436 - 0.5).astype(int)
+        radar = make_radar(np.arange(400), bins)
+        ranges, azimuths = (bins + 0.5) * 0.0436 - 0.4, radar.azimuths
+        wall = ranges[:, None] * np.column_stack([np.cos(azimuths), np.sin(azimuths)])
+        cloud = np.vstack([lift(wall, z) for z in np.arange(-0.9, 2.0, 0.3)])
+        pairs.append(make_pair(cloud, radar, (0.0, 0.0, 0.0)))
+    walls = measure_walls(pairs, Calibration())
+    values, errors = fit_ranges(walls)
+    assert len(walls) > 1000 and values == pytest.approx([0.0436, -0.4], abs=2e-3)
+    assert (errors < 2e-3).all()
+    low = [replace(pair, cloud=pair.cloud[pair.cloud[:, 2] < 0.0]) for pair in pairs]  # a kerb is no wall
+    assert len(measure_walls(low, Calibration())) == 0
+    assert np.isnan(fit_ranges(walls[:0])).all()
+
+
+def test_duration_of_a_sweep_that_made_the_sweeps_is_found(tmp_path: Path) -> None:
+    """Poles seen from a vehicle at 10 m/s by a lidar that turns once in 50 ms."""
+    rng = np.random.default_rng(4)
+    poles = np.column_stack([rng.uniform(-25.0, 45.0, 900), rng.uniform(-25.0, 25.0, 900)])
+    lidar = np.linalg.inv(relate_sensors(EXTRINSICS["radar"], EXTRINSICS["velodyne_left"]))
+    start = 1_547_131_046_000_000
+    stamps = start + 50_000 * np.arange(16)
+    sweeps = []
+    for stamp in stamps:
+        seconds = np.zeros(len(poles))
+        for _ in range(6):
+            x = poles[:, 0] - 10.0 * ((stamp - start) / 1e6 + seconds)
+            seen = np.column_stack([x, poles[:, 1], np.zeros(len(poles)), np.ones(len(poles))]) @ lidar.T
+            clockwise = -np.arctan2(seen[:, 1], seen[:, 0])
+            seconds = 0.05 * np.mod(clockwise - np.pi / 2.0, 2.0 * np.pi) / (2.0 * np.pi)
+        order = np.argsort(seconds)
+        level = np.hypot(seen[:, 0], seen[:, 1])[order]
+        lasers = [
+            np.column_stack([seen[order, :2], FIRE_HEIGHT + level * np.tan(up), np.ones(len(order))])
+            for up in (0.0, 0.0232, 0.0466)
+        ]
+        path = tmp_path / f"{stamp}.bin"
+        save_velodyne_binary(path, np.vstack(lasers).astype(np.float32))
+        sweeps.append(Sweep(path, "velodyne_left", int(stamp)))
+    first = start + np.arange(-2, 6) * 250_000
+    moved = np.tile([2.5, 0.0, 0.0, 0.0, 0.0, 0.0], (7, 1))
+    mid = first + 125_000
+    odometry = RadarOdometry(mid[1:], mid[:-1], first[1:], first[:-1], moved)
+    save_radar_odometry(tmp_path / "radar_odometry.csv", odometry)
+    spans = np.arange(-0.05, 0.151, 0.025)
+    apart = sweep_consistency(sweeps, tmp_path / "radar_odometry.csv", spans, lag=10, n_pairs=4)
+    span, error = fit_span(spans, apart, np.random.default_rng(5))
+    assert span == pytest.approx(0.05, abs=0.01) and error < 0.02
+    assert spans[apart.mean(axis=0).argmin()] == pytest.approx(0.05)
+    none = sweep_consistency(sweeps[:5], tmp_path / "radar_odometry.csv", spans)
+    assert none.shape == (0, len(spans)) and np.isnan(fit_span(spans, none, np.random.default_rng(5))).all()
+
+
 def test_plane_of_the_street_is_fitted_below_cars_and_walls() -> None:
     rng = np.random.default_rng(3)
     xy = rng.uniform(-25.0, 25.0, (4000, 2))
@@ -103,6 +168,22 @@ def test_points_are_described_by_what_the_lidar_has_around_them() -> None:
     assert table.from_path_m.tolist() == pytest.approx([8.0, 6.0, 16.0, 0.0], abs=0.01)
     assert table.is_hidden.tolist() == [False, False, True, False]
     assert (table.distance_m < 1.0).tolist() == [True, True, False, False]
+    kinds = tabulate_kinds([pair, pair], [{"some": points}, {"some": points, "none": points[:0]}])
+    row = kinds.loc["some"]
+    assert row["points"].tolist() == [25.0, 50.0, 25.0] and row["within 1 m"].tolist() == [0.0, 100.0, 0.0]
+    assert row["over 2 m off"].tolist() == [50.0, 25.0]  # one of two is hidden behind the wall
+    reached = row["lidar points reached"]
+    assert 0.0 < reached["higher"] < reached["below 1 m"] < 100.0
+
+
+def test_points_are_compared_with_a_map_where_the_pose_is_known() -> None:
+    wall = np.column_stack([np.arange(-20.0, 20.0, 0.25), np.full(160, 8.125)])
+    pair = make_pair(lift(wall, 1.0))
+    pairs, points = [{("compensated", "turn"): pair}], [{"some": np.array([[0.0, 8.0], [0.0, 3.0]])}]
+    tree = cKDTree(transform_points((100.0, 50.0, 0.5), wall))
+    table = tabulate_on_map(pairs, points, {1: np.array([100.0, 50.0, 0.5])}, tree)
+    assert table.share_1m.to_dict() == {"lidar, turn": 1.0, "some": 0.5}
+    assert len(tabulate_on_map(pairs, points, {2: np.zeros(3)}, tree)) == 0
 
 
 def test_distance_is_taken_from_a_curved_path_and_its_straight_continuation() -> None:
