@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 import cv2
 import numpy as np
 import pandas as pd
-from scipy.ndimage import gaussian_filter, gaussian_filter1d, uniform_filter1d
+from scipy.ndimage import gaussian_filter, gaussian_filter1d, minimum_filter1d, uniform_filter1d
 from scipy.optimize import least_squares, minimize
 from scipy.spatial import cKDTree
 
@@ -782,7 +782,7 @@ def describe_points(points: np.ndarray, pair: Pair, path: np.ndarray | None = No
 
 
 def _first_ranges(points: np.ndarray, lidar: np.ndarray, n_sectors: int = 360) -> np.ndarray:
-    """Find the range of the nearest lidar point in the direction of each point; infinite without one [m]."""
+    """Find the range of the nearest lidar point within 1.5 sectors of each point's direction; infinite without one [m]."""
     sector, own = (
         (np.mod(np.arctan2(p[:, 1], p[:, 0]), 2.0 * np.pi) / (2.0 * np.pi) * n_sectors).astype(int)
         % n_sectors
@@ -790,7 +790,7 @@ def _first_ranges(points: np.ndarray, lidar: np.ndarray, n_sectors: int = 360) -
     )
     first = np.full(n_sectors, np.inf)
     np.minimum.at(first, sector, np.hypot(*lidar.T))
-    return first[own]
+    return minimum_filter1d(first, 3, mode="wrap")[own]
 
 
 def tabulate_kinds(

@@ -92,7 +92,7 @@ def test_ranges_are_fitted_to_walls() -> None:
     pairs = []
     for first in (6.0, 7.0, 8.0):
         bins = np.rint((np.linspace(first, 40.0, 400) + 0.4) / 0.0436 - 0.5).astype(int)
-        radar = make_radar(np.arange(400), bins)
+        radar = make_radar(np.repeat(np.arange(400), 9), (bins[:, None] + np.arange(-4, 5)).ravel())
         ranges, azimuths = (bins + 0.5) * 0.0436 - 0.4, radar.azimuths
         wall = ranges[:, None] * np.column_stack([np.cos(azimuths), np.sin(azimuths)])
         cloud = np.vstack([lift(wall, z) for z in np.arange(-0.9, 2.0, 0.3)])
