@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 import pandas as pd
 from scipy.ndimage import gaussian_filter, gaussian_filter1d, minimum_filter1d, uniform_filter1d
-from scipy.optimize import least_squares, minimize
+from scipy.optimize import minimize
 from scipy.spatial import cKDTree
 
 from rol.bev import image_to_points, points_to_image
@@ -100,7 +100,8 @@ class Pair:
     def tops(self) -> np.ndarray:
         """Height above the ground of the highest point in the pixel of each of the lidar points, shape (m,) [m]."""
         height, forward, left = np.nan_to_num(fit_ground(self.cloud))
-        ground = (height or -2.0) + self.objects[:, :2] @ (forward, left)
+        around = np.clip(self.objects[:, :2], -15.0, 15.0)  # farther away the slope is not known
+        ground = (height or -2.0) + around @ (forward, left)
         _, pixel = cKDTree(self.lidar_points).query(self.objects[:, :2])
         tops = np.full(len(self.lidar_points), -np.inf)
         np.maximum.at(tops, pixel, self.objects[:, 2] - ground)
@@ -597,7 +598,7 @@ def measure_walls(pairs: Sequence[Pair], calibration: Calibration) -> pd.DataFra
             wall = float(np.median(ranges[first]))
             echo = _find_echo(smooth[row], (wall - calibration.offset_m) / calibration.resolution_m - 0.5)
             found.append((number, wall, echo, abs(np.sin(azimuths[row]))))
-    table = pd.DataFrame(found, columns=["scan", "range_m", "bin", "aside"])
+    table = pd.DataFrame(found, columns=["scan", "range_m", "bin", "aside"], dtype=float)
     return table[np.isfinite(table.bin)].reset_index(drop=True)
 
 
@@ -629,11 +630,11 @@ def fit_ranges(walls: pd.DataFrame) -> tuple[np.ndarray, np.ndarray]:
     """
 
     def fit(table: pd.DataFrame) -> np.ndarray:
-        def residuals(x: np.ndarray) -> np.ndarray:
-            return (table.bin + 0.5) * x[0] + x[1] - table.range_m
-
-        start = [MEASURED.resolution_m, MEASURED.offset_m]
-        return least_squares(residuals, start, loss="soft_l1", f_scale=0.1, x_scale=(1e-4, 0.1)).x
+        weights = np.ones(len(table))
+        for _ in range(20):  # iteratively reweighted: distances beyond 0.1 m count linearly
+            line = np.polyfit(table.bin + 0.5, table.range_m, 1, w=np.sqrt(weights))
+            weights = 1.0 / np.hypot(1.0, (np.polyval(line, table.bin + 0.5) - table.range_m) / 0.1)
+        return line
 
     if len(walls) < 20:
         return np.full(2, np.nan), np.full(2, np.nan)
