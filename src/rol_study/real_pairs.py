@@ -45,6 +45,7 @@ REFERENCES = ("nearest", "turn")  # sweeps that the lidar points come from
 COLUMNS = ["timestamp_us", "front_end", "motion", "sweeps", "n_points", "n_lidar_points", "precision_1m"]
 COLUMNS += ["precision_2m", "recall_1m", "recall_2m", "misalignment_forward_m", "misalignment_left_m"]
 PIXEL_M = 0.25
+OWN_VEHICLE_M = 4.0  # nearer lidar points may be on the vehicle itself [m]
 
 
 # ---- one scan and its sweeps ----
@@ -771,13 +772,14 @@ def describe_points(points: np.ndarray, pair: Pair, path: np.ndarray | None = No
         direction, where the lidar cannot confirm or refute it.
     """
     distances, nearest = cKDTree(pair.lidar_points).query(points)
+    others = crop_range(pair.lidar_points, min_range=OWN_VEHICLE_M)
     tops = np.append(pair.tops, np.nan)  # the last one for points without any lidar point
     return pd.DataFrame(
         {
             "distance_m": distances,
             "top_m": tops[nearest],
             "from_path_m": distance_from_path(points, pair.scan, path),
-            "is_hidden": np.hypot(*points.T) > _first_ranges(points, pair.lidar_points) + 1.0,
+            "is_hidden": np.hypot(*points.T) > _first_ranges(points, others) + 1.0,
         }
     )
 

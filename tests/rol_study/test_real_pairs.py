@@ -163,6 +163,9 @@ def test_points_are_described_by_what_the_lidar_has_around_them() -> None:
     is_wall = pair.lidar_points[:, 1] > 0
     assert np.allclose(tops[is_wall], 5.0, atol=0.1) and np.allclose(tops[~is_wall], 0.8, atol=0.1)
     points = np.array([[0.0, 8.0], [7.0, -6.0], [1.0, 16.0], [10.0, 0.0]])
+    pair = replace(
+        pair, cloud=np.vstack([cloud, [[2.0, 0.0, -0.5, 0.0]]])
+    )  # the vehicle's own bonnet hides nothing
     table = describe_points(points, pair)
     assert table.top_m.tolist() == pytest.approx([5.0, 0.8, 5.0, 0.8], abs=0.1)
     assert table.from_path_m.tolist() == pytest.approx([8.0, 6.0, 16.0, 0.0], abs=0.01)
