@@ -663,7 +663,8 @@ def calibrate(pairs: Sequence[Pair]) -> tuple[pd.DataFrame, pd.DataFrame]:
         Columns ``value`` and ``error`` (standard error) of ``rotation_deg``, ``forward_m``, ``left_m`` (fitted together),
         the rotation by points near and far from the radar alone, ``delay_ms``, ``doppler_s`` (fitted together with a
         rotation and a shift to the left), ``resolution_m`` and ``offset_m`` (fitted to the walls), and the offset with
-        that resolution by walls beside, and ahead or behind, alone.
+        that resolution by walls beside, and ahead or behind, alone; ``beyond_m``, the median distance by which the
+        ranges used in this project show walls too far away.
     walls : pandas.DataFrame
         As of `measure_walls`.
     """
@@ -683,6 +684,8 @@ def calibrate(pairs: Sequence[Pair]) -> tuple[pd.DataFrame, pd.DataFrame]:
     for name, is_there in {"beside": walls.aside > 0.8, "ahead or behind": walls.aside < 0.6}.items():
         by_scan = offsets[is_there].groupby(walls.scan[is_there]).median()
         rows[f"offset_m, walls {name}"] = offsets[is_there].median(), by_scan.sem()
+    beyond = (walls.bin + 0.5) * MEASURED.resolution_m + MEASURED.offset_m - walls.range_m
+    rows["beyond_m"] = beyond.median(), beyond.groupby(walls.scan).median().sem()
     return pd.DataFrame(rows, index=["value", "error"]).T, walls
 
 
@@ -842,6 +845,41 @@ def tabulate_kinds(
         "over 2 m off": own[["all", "in_view"]].mean(),
     }
     return 100.0 * pd.concat(parts, axis=1)
+
+
+def tabulate_corrected(
+    pairs: Sequence[Pair], points: Sequence[Mapping[str, np.ndarray]], rotation_deg: float, beyond_m: float
+) -> pd.DataFrame:
+    """Compare points as they are, and with a rotation and a range error removed, with the lidar points of pairs.
+
+    Parameters
+    ----------
+    pairs : sequence of Pair
+        The pairs.
+    points : sequence of mapping
+        Of each pair: front end -> points, shape (n, 2) [m].
+    rotation_deg : float
+        Rotation of the radar against the lidar, counter-clockwise [deg].
+    beyond_m : float
+        Distance by which the radar shows things too far away [m].
+
+    Returns
+    -------
+    table : pandas.DataFrame
+        One row per front end; of "as is" and "corrected" the percentages within 0.25, 0.5 and 1 m, means over pairs.
+    """
+    rows = []
+    for pair, clouds in zip(pairs, points, strict=True):
+        for name, cloud in clouds.items():
+            ranges = np.hypot(*cloud.T)
+            nearer = cloud * (1.0 - beyond_m / np.maximum(ranges, 1.0))[:, None]
+            turned = transform_points((0.0, 0.0, -np.deg2rad(rotation_deg)), nearer)
+            for words, some in (("as is", cloud), ("corrected", turned)):
+                away = nn_distances(some, pair.lidar_points)
+                fractions = {f"{r:g} m": 100.0 * fraction_within(away, r) for r in (0.25, 0.5, 1.0)}
+                rows.append({"front_end": name, "points": words} | fractions)
+    table = pd.DataFrame(rows).groupby(["front_end", "points"], sort=False).mean().unstack()
+    return table.swaplevel(axis=1)[["as is", "corrected"]]
 
 
 def tabulate_on_map(

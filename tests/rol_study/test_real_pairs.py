@@ -32,6 +32,7 @@ from rol_study.real_pairs import (
     measure_walls,
     sweep_consistency,
     tabulate,
+    tabulate_corrected,
     tabulate_kinds,
     tabulate_on_map,
 )
@@ -177,6 +178,18 @@ def test_points_are_described_by_what_the_lidar_has_around_them() -> None:
     assert row["over 2 m off"].tolist() == [50.0, 25.0]  # one of two is hidden behind the wall
     reached = row["lidar points reached"]
     assert 0.0 < reached["higher"] < reached["below 1 m"] < 100.0
+
+
+def test_correction_of_the_calibration_brings_points_to_the_wall() -> None:
+    turn = np.deg2rad(np.arange(0.0, 360.0, 0.5))
+    ranges = 20.0 + 5.0 * np.sin(8.0 * turn)
+    lidar, radar = (
+        r[:, None] * np.column_stack([np.cos(turn + by), np.sin(turn + by)])
+        for r, by in ((ranges, 0.0), (ranges + 0.5, np.deg2rad(2.0)))
+    )
+    table = tabulate_corrected([make_pair(lift(lidar))], [{"some": radar}], 2.0, 0.5)
+    assert (table.loc["some", "corrected"] == 100.0).all()
+    assert table.loc["some", ("as is", "0.25 m")] < 50.0
 
 
 def test_points_are_compared_with_a_map_where_the_pose_is_known() -> None:
