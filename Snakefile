@@ -165,6 +165,7 @@ STEPS = {
         {"tables": found("data/paper/*.csv"), "measured": found("data/ablations/route_*.csv")},
         {},
     ),
+    "real_pairs": ("09_real_pairs", "real pairs", {"shipped": SHIPPED}, {}),
     "robust_filter": (
         "12_robust_filter",
         "the robust filter",
@@ -198,7 +199,9 @@ BEFORE = {  # commands that come before papermill
     )
 }
 # All others have 0. Those with -1 need no other chapter and fill gaps.
-PRIORITIES = {"real_vs_fake": 1, "oxford_route": -1, "robust_filter": -1, "ablations": -1, "runtime": -1}
+PRIORITIES = {"real_vs_fake": 1} | dict.fromkeys(
+    ("real_pairs", "oxford_route", "robust_filter", "ablations", "runtime"), -1
+)
 
 
 rule book:

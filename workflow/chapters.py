@@ -40,6 +40,7 @@ CHAPTERS = {
     "06_ground_truth": "once",
     "07_localization": "method",
     "08_results": "once",
+    "09_real_pairs": "once",
     "10_real_radar": "once",
     "11_oxford_route": "once",
     "12_robust_filter": "once",

@@ -309,10 +309,14 @@ def velodyne_raw_to_points(raw: VelodyneRaw, min_range_m: float = 1.0) -> tuple[
 
 
 def check_binary(path: Path | str, points: np.ndarray) -> None:
-    """Raise an OxfordError for points that are not finite or whose intensity is not a byte's."""
+    """Raise an OxfordError for points that are not finite or whose intensity is not a byte's.
+
+    A file that lost whole points has heights in place of its first intensities; these are fractions.
+    """
     check_points(points, str(path), columns=4, error=OxfordError)
-    if points[:, 3].min() < 0 or points[:, 3].max() > 255:
-        raise OxfordError(f"{path}: not four rows x, y, z, intensity: the intensities lie outside 0..255")
+    if points[:, 3].min() < 0 or points[:, 3].max() > 255 or (points[:, 3] % 1.0).any():
+        fault = "the intensities lie outside 0..255 or are fractions; truncated?"
+        raise OxfordError(f"{path}: not four rows x, y, z, intensity: {fault}")
 
 
 def load_velodyne_binary(path: Path | str) -> np.ndarray:

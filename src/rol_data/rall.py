@@ -120,15 +120,38 @@ class RealScan:
     twist: tuple[float, float, float] | None
 
 
-def find_real_root(given: str | Path = "", place: str = "oxford") -> Path | None:
-    """Find the folder of the real data.
+def real_folder(given: str | Path = "") -> Path:
+    """Return the folder of the real data, whatever it holds.
 
     Parameters
     ----------
     given : path
-        The folder; if empty, the environment variable ROL_REAL_ROOT, and `data/real` where that is not set.
+        Folder of the real data; if empty, the environment variable ``ROL_REAL_ROOT``, else ``data/real``.
+
+    Returns
+    -------
+    root : Path
+        The folder; it may be missing.
+
+    Raises
+    ------
+    RallError
+        If a folder is given and does not exist.
+    """
+    if given and not Path(given).is_dir():
+        raise RallError(f"real_root: there is no folder {given}")
+    return Path(given or os.environ.get("ROL_REAL_ROOT") or "data/real")
+
+
+def find_real_root(given: str | Path = "", place: str = "oxford") -> Path | None:
+    """Find the folder of the real data, if it holds the lidar map of a place.
+
+    Parameters
+    ----------
+    given : path
+        As in `real_folder`, which may raise.
     place : str
-        Place whose map the folder must hold, one of `PLACES`.
+        A name of `PLACES`.
 
     Returns
     -------
@@ -140,10 +163,7 @@ def find_real_root(given: str | Path = "", place: str = "oxford") -> Path | None
     RallError
         If a folder is given and does not exist, or the place is unknown.
     """
-    map_path = find_place(place).map_path
-    if given and not Path(given).is_dir():
-        raise RallError(f"real_root: there is no folder {given}")
-    root = Path(given or os.environ.get("ROL_REAL_ROOT") or "data/real")
+    root, map_path = real_folder(given), find_place(place).map_path
     return root if (root / map_path).is_file() else None
 
 

@@ -44,7 +44,12 @@ RULES = {
 }
 BROWSERS = 2  # for the pages of a book, each in its own thread
 FIRST_SCREEN_PX = 800  # height of the window of a small laptop
-NEED_REAL_DATA = ("11_oxford_route", "12_robust_filter", "10_real_radar")  # without it they have no picture
+NEED_REAL_DATA = (
+    "09_real_pairs",
+    "10_real_radar",
+    "11_oxford_route",
+    "12_robust_filter",
+)  # without it no picture
 
 
 @dataclass(frozen=True)

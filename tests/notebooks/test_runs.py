@@ -66,6 +66,22 @@ def test_every_route_run_wrote_its_files(profile: dict, real_root: Path) -> None
             assert metrics["rmse_m"] < limit_m and metrics["within_1m_2deg"] > share
 
 
+def test_every_real_pair_is_compared(profile: dict, real_root: Path) -> None:
+    rows = pd.read_csv(Path(profile["out_dir"], "real_pairs", "pairs.csv"))
+    names = ["timestamp_us", "front_end", "motion", "sweeps", "n_points", "n_lidar_points", "precision_1m"]
+    names += ["precision_2m", "recall_1m", "recall_2m", "misalignment_forward_m", "misalignment_left_m"]
+    assert list(rows.columns) == names
+    stamps = {int(path.stem) for path in (real_root / "RadarSLAMPy/data/tiny/radar").glob("*.png")}
+    assert stamps <= set(rows["timestamp_us"])
+    rows = rows[rows["timestamp_us"].isin(stamps)]
+    assert set(rows["front_end"]) == {"k-strongest", "cfar", "paper", "paper-no-gan", "unet"}
+    assert len(rows) == len(stamps) * 5 * 4 == len(rows.drop_duplicates(names[:4]))
+    assert rows[names[6:10]].stack().between(0.0, 1.0).all()
+    # As recorded the radar image lies beside the lidar image; with motion compensated they coincide.
+    off = rows.groupby("motion")[names[10:]].mean().abs().max(axis=1)
+    assert off["compensated"] < 0.35 < off["none"]
+
+
 def test_every_real_scan_is_judged(profile: dict, real_root: Path) -> None:
     rows = pd.read_csv(Path(profile["out_dir"], "real_radar", "scans.csv"))
     shares = ["share_1m_raw", "share_2m_raw", "share_1m_fake", "share_2m_fake"]

@@ -425,6 +425,7 @@ def test_both_formats_give_the_same_points(tmp_path):
         (np.arange(7), r"28 bytes are not four rows of float32; the file is truncated"),
         (np.array([1, 2, 3, np.nan, 5, 6, 7, 8]), r"point 1 is not finite"),
         (np.array([[1, 2, 3, 9], [4, -5, -6, 9]]).ravel(), r"intensities lie outside 0\.\.255"),
+        (np.array([[1, 2, 3, 9], [4, 5, 6, 7.5]]).ravel(), r"or are fractions; truncated\?"),
     ],
 )
 def test_binary_faults_are_named(tmp_path, values, fault):
