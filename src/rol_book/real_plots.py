@@ -163,7 +163,9 @@ def draw_scans_as_in_paper(
     size, widths = (9.6, 2.3 * len(results)), (1, 1, 1, 1.15)
     figure, axes = plt.subplots(len(results), 4, figsize=size, width_ratios=widths, dpi=80, squeeze=False)
     images = [[clean(radar_image), generated] for _, radar_image, generated in results]
-    plots.draw_image_grid(axes[:, :2], images, ("real radar", "fake lidar"), labels, half=50.0, vmax=(70, 255))
+    plots.draw_image_grid(
+        axes[:, :2], images, ("real radar", "fake lidar"), labels, half=50.0, vmax=(70, 255)
+    )
     for row, (points, _, _), pose in zip(axes, results, poses, strict=True):
         placed = transform_points(pose, points)
         away = map_tree.query(placed)[0]
@@ -303,4 +305,84 @@ def draw_localization(
         ax.set(ylabel=unit, ylim=(0, None))
     axes[0].legend(loc="upper right")
     axes[1].set_xlabel("time since the first scan [s]")
+    return figure
+
+
+def draw_submap(
+    submap: np.ndarray,
+    map_points: np.ndarray,
+    path: np.ndarray,
+    changes: Any,
+    sharpness: tuple[np.ndarray, np.ndarray],
+) -> Figure:
+    """Draw a registered submap, what has changed since the map was made, and the submap's sharpness.
+
+    Parameters
+    ----------
+    submap, map_points : array, shape (n, 2) and (m, 2)
+        Points of submap and map [m].
+    path : array, shape (k, 3)
+        Poses of the sweeps in the map [m, m, rad].
+    changes : Changes
+        ``same``, ``new``, ``confirmed``, ``gone``, ``hidden``: points [m].
+    sharpness : tuple of array, shape (j,)
+        Rotations [deg], and number of occupied cells.
+
+    Returns
+    -------
+    figure : Figure
+    """
+    figure = plt.figure(figsize=(9.6, 4.6), dpi=100)
+    first, second, third = figure.subfigures(1, 3, width_ratios=(1, 1, 0.72))
+    middle = path[:, :2].mean(axis=0)
+    size = (np.ptp(path[:, :2], axis=0).max() / 2.0 + 32.0) * 1.0
+    ax = first.subplots()
+    plots.show_points(ax, crop(map_points, middle, size), colour=COLOURS["map"], size=1.5, label="map")
+    plots.show_points(ax, crop(submap, middle, size), colour=COLOURS["real"], size=1.0, label="submap")
+    plots.draw_track(ax, path, colour=COLOURS["truth"])
+    ax.set_title("registered")
+    other = second.subplots()
+    kinds = {"same": "#C9C9C9", "confirmed": "#C9C9C9", "hidden": "#E9E9E9"}
+    for kind, colour in kinds.items():
+        plots.show_points(other, getattr(changes, kind), colour=colour, size=1.0)
+    plots.show_points(other, changes.new, colour=COLOURS["estimate"], size=2.5, label="new")
+    plots.show_points(other, changes.gone, colour=COLOURS["real"], size=2.5, label="gone")
+    plots.draw_track(other, path, colour=COLOURS["truth"])
+    other.set(title="changes", ylabel="")
+    for axes in (ax, other):
+        plots.zoom(axes, middle, size)
+        axes.legend(loc="upper left", markerscale=4, frameon=True, fontsize=8.5)
+    last = third.subplots()
+    last.plot(sharpness[0], sharpness[1] / 1000.0, "o-", color=COLOURS["real"])
+    last.axvline(0.0, color="#444444", linewidth=0.9, linestyle="--")
+    last.set(title="sharpness", xlabel="rotation of the sweeps [deg]", ylabel="occupied cells [thousands]")
+    return figure
+
+
+def draw_lidar_and_map(
+    clouds: Sequence[tuple[np.ndarray, np.ndarray, str]], titles: Sequence[str], *, half: float = 45.0
+) -> Figure:
+    """Draw points over reference points side by side.
+
+    Parameters
+    ----------
+    clouds : sequence of (reference, points, name of a colour)
+        Reference points, shape (m, 2), and points, shape (n, 2), around the radar [m].
+    titles : sequence of str
+        Titles.
+    half : float
+        Half the edge of the square shown [m].
+
+    Returns
+    -------
+    figure : Figure
+    """
+    width = 9.6 / len(clouds)
+    figure, axes = plt.subplots(1, len(clouds), figsize=(9.6, width + 0.4), dpi=100)
+    for ax, (reference, points, colour), title in zip(axes, clouds, titles, strict=True):
+        plots.show_points(ax, crop(reference, np.zeros(2), 1.2 * half), colour=COLOURS["map"], size=0.6)
+        plots.show_points(ax, points, colour=COLOURS[colour], size=3.0, title=title)
+        plots.zoom(ax, (0.0, 0.0), half)
+    for ax in axes[1:]:
+        ax.set_ylabel("")
     return figure

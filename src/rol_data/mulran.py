@@ -85,8 +85,14 @@ def load_scan(path: Path | str) -> MulranScan:
     stamps = np.ascontiguousarray(image[:, :8]).view("<i8").ravel()
     counts = np.ascontiguousarray(image[:, 8:10]).view("<u2").ravel().astype(np.int64)
     steps = np.diff(counts) % COUNTS_PER_TURN
-    if (np.diff(stamps) < 0).any() or stamps[0] <= 0 or not 0 < int(stamps[-1]) - int(stamps[0]) < MAX_TURN_NS:
-        raise MulranError(f"{path}: no header: the row times {stamps[0]} .. {stamps[-1]} ns are not those of one turn")
+    if (
+        (np.diff(stamps) < 0).any()
+        or stamps[0] <= 0
+        or not 0 < int(stamps[-1]) - int(stamps[0]) < MAX_TURN_NS
+    ):
+        raise MulranError(
+            f"{path}: no header: the row times {stamps[0]} .. {stamps[-1]} ns are not those of one turn"
+        )
     if counts.max() >= COUNTS_PER_TURN or (steps == 0).any() or steps.sum() >= COUNTS_PER_TURN:
         raise MulranError(f"{path}: no header: the encoder counts do not go clockwise once around")
     power = np.ascontiguousarray(image[:, N_HEADER:])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -27,7 +28,9 @@ from rol_data.rall import RealScan
 
 WRONG_HEADINGS = (1.57, 3.14, -1.57)  # at which the fraction by chance is measured [rad]
 FOG = {"range_resolution": RANGE_RESOLUTION, "range_offset": 0.0}  # settings of the images of RADIATE's radar
-Generate = Callable[..., tuple[np.ndarray, np.ndarray, np.ndarray]]  # as `rol_beyond.front_ends.generate_points`
+Generate = Callable[
+    ..., tuple[np.ndarray, np.ndarray, np.ndarray]
+]  # as `rol_beyond.front_ends.generate_points`
 
 
 # ---- precision ----
@@ -93,7 +96,10 @@ def front_end_points(
     points["cfar"] = detect_points(power, azimuths, twist, detector="cfar", **own, **(cfar or {}))
     for name, network in networks.items():
         if calibration:
-            range_settings = {"range_resolution": calibration.resolution_m, "range_offset": calibration.offset_m}
+            range_settings = {
+                "range_resolution": calibration.resolution_m,
+                "range_offset": calibration.offset_m,
+            }
             network = replace(network, settings=network.settings | range_settings)
         points[name] = generate(network, power, azimuths, twist)[0]
     return points
@@ -143,7 +149,11 @@ def evaluate_front_ends(
             one = generate(network, scan.power, scan.azimuths, scan.twist, tta_rotations=1)
             points[f"{chosen}, one heading"] = one[0]
         rows += [
-            {"timestamp_us": scan.stamp_us, "points": name, **evaluate_with_chance(found, scan.pose, map_tree)}
+            {
+                "timestamp_us": scan.stamp_us,
+                "points": name,
+                **evaluate_with_chance(found, scan.pose, map_tree),
+            }
             for name, found in points.items()
         ]
     names = ["timestamp_us", "points", "n", "share_1m", "share_2m", "chance_1m", "chance_2m"]
@@ -230,7 +240,9 @@ def evaluate_pairs(
             near = nn_distances(crop_range(cloud, reach_m), crop_range(sweep, reach_m + 10.0))
             back = nn_distances(crop_range(sweep, reach_m, MIN_RANGE_M), crop_range(cloud, reach_m + 10.0))
             fractions = {f"share_{r}m": fraction_within(near, r) for r in (1, 2)}
-            rows.append({"points": name, "n": len(near), **fractions, "reached_1m": fraction_within(back, 1.0)})
+            rows.append(
+                {"points": name, "n": len(near), **fractions, "reached_1m": fraction_within(back, 1.0)}
+            )
     return pd.DataFrame(rows)
 
 
@@ -298,7 +310,9 @@ def cache_front_end(make_points: FrontEnd) -> FrontEnd:
     return points_of
 
 
-def crop_map(map_points: np.ndarray, map_tree: cKDTree, poses: np.ndarray, reach_m: float = 120.0) -> np.ndarray:
+def crop_map(
+    map_points: np.ndarray, map_tree: cKDTree, poses: np.ndarray, reach_m: float = 120.0
+) -> np.ndarray:
     """Keep the points of a map near some poses, shape (n, 2) [m], in their order."""
     around = np.unique(np.concatenate(map_tree.query_ball_point(poses[:, :2], reach_m)))
     return map_points[around.astype(int)]
@@ -354,7 +368,9 @@ def position_and_heading_errors(poses: np.ndarray, truth: np.ndarray) -> np.ndar
     return np.stack([np.hypot(x, y), np.rad2deg(np.abs(yaw))], axis=-1)
 
 
-def summarize_starts(errors: Sequence[np.ndarray], first_scan: int, limits: Sequence[float]) -> dict[str, Any]:
+def summarize_starts(
+    errors: Sequence[np.ndarray], first_scan: int, limits: Sequence[float]
+) -> dict[str, Any]:
     """Summarize errors over runs from several starts.
 
     Parameters
@@ -380,3 +396,105 @@ def summarize_starts(errors: Sequence[np.ndarray], first_scan: int, limits: Sequ
     worst = np.max([e.max(axis=(0, 1)) for e in later], axis=0) if later else np.full(2, np.nan)
     met = float(np.mean([(e <= limits).all(axis=(1, 2)) for e in later])) if later else np.nan
     return {"median": np.array(median), "worst": worst, "met": met}
+
+
+def tabulate_starts(summaries: Mapping[str, Mapping[str, Any]], n_scans: int = 11) -> pd.DataFrame:
+    """Tabulate summaries of `summarize_starts`, a row per scan and two columns per summary.
+
+    Parameters
+    ----------
+    summaries : mapping of str to mapping
+        Label -> summary.
+    n_scans : int
+        Largest number of scans shown.
+
+    Returns
+    -------
+    table : pandas.DataFrame
+        Medians per scan, and the worst errors of the scans that are judged [m, deg].
+    """
+    columns = {
+        f"{label} [{unit}]": [*summary["median"][:n_scans, k], summary["worst"][k]]
+        for label, summary in summaries.items()
+        for k, unit in enumerate(("m", "deg"))
+    }
+    n_rows = len(next(iter(columns.values()))) - 1
+    return pd.DataFrame(columns, [*(f"scan {i + 1}, median" for i in range(n_rows)), "worst of those judged"])
+
+
+def localize_points(
+    points: np.ndarray,
+    pose: np.ndarray,
+    map_points: np.ndarray,
+    offsets: np.ndarray,
+    settings: LocalizerSettings,
+    seed: int,
+) -> np.ndarray:
+    """Localize one cloud by one update of the filter from several starts.
+
+    Parameters
+    ----------
+    points : array, shape (n, 2)
+        Points in the radar frame [m].
+    pose : array, shape (3,)
+        True pose [m, m, rad].
+    map_points : array, shape (m, 2)
+        Points of the map [m].
+    offsets : array, shape (s, 3)
+        Starts in the true radar frame, from `wrong_starts` [m, m, rad].
+    settings : LocalizerSettings
+        Of the localizer.
+    seed : int
+        Seed of each run.
+
+    Returns
+    -------
+    errors : array, shape (s, 2)
+        Distance and angle to the true pose [m, deg].
+    """
+    scan = SimpleNamespace(stamp_us=0)
+    starts = compose(pose, offsets)
+    found = localize_from_starts([scan], lambda *_: points, map_points, starts, settings, [seed])
+    return position_and_heading_errors(found[:, 0], pose)
+
+
+def evaluate_turn(
+    scan: RealScan,
+    front_ends: Mapping[str, FrontEnd],
+    variants: Mapping[str, tuple[bool, float]],
+    map_points: np.ndarray,
+    localize: Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray],
+) -> tuple[pd.DataFrame, dict[tuple[str, str], np.ndarray]]:
+    """Evaluate a scan with and without motion compensation, and with turned azimuths.
+
+    Parameters
+    ----------
+    scan : RealScan
+        Scan with pose and twist.
+    front_ends : mapping of str to callable
+        Front ends by name, as in `rol_beyond.pipeline.RobustLocalizer`.
+    variants : mapping of str to (bool, float)
+        Name -> whether motion is compensated, and the angle added to the azimuths [rad].
+    map_points : array, shape (m, 2)
+        Points of the map [m].
+    localize : callable
+        Takes points, the true pose and the map and returns errors, shape (s, 2) [m, deg]; see `localize_points`.
+
+    Returns
+    -------
+    table : pandas.DataFrame
+        One row per variant and front end: fractions ``share_1m`` and ``share_2m`` at the true pose; medians ``m`` and ``deg``
+        and the largest ``worst_m`` of the errors.
+    points : dict
+        (variant, front end) -> points, shape (n, 2) [m].
+    """
+    points, rows, tree = {}, {}, cKDTree(map_points)
+    for variant, (is_compensated, turn) in variants.items():
+        turned = replace(scan, azimuths=scan.azimuths + turn)
+        for name, make_points in front_ends.items():
+            cloud = points[variant, name] = make_points(turned, scan.twist if is_compensated else None)
+            errors = localize(cloud, scan.pose, map_points)
+            shares = evaluate_on_map(cloud, scan.pose, tree)
+            middle = dict(zip(("m", "deg"), np.median(errors, axis=0), strict=True))
+            rows[variant, name] = {**shares, **middle, "worst_m": errors[:, 0].max()}
+    return pd.DataFrame.from_dict(rows, orient="index").drop(columns="n"), points

@@ -112,7 +112,9 @@ def test_keyframes_have_the_times_of_their_numbers(tmp_path: Path) -> None:
         ("1.5\n", None, "Scans: holds no cloud"),
     ],
 )
-def test_keyframes_at_fault_are_named(tmp_path: Path, times: str | None, cloud: str | None, fault: str) -> None:
+def test_keyframes_at_fault_are_named(
+    tmp_path: Path, times: str | None, cloud: str | None, fault: str
+) -> None:
     folder = tmp_path / mulran.KEYFRAMES_PATH
     folder.mkdir(parents=True)
     if times is not None:

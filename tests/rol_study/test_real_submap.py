@@ -33,7 +33,9 @@ def write_sweep(path: Path, stamp_us: int) -> None:
     """A sweep of `PLACES`, and of the ground, by a radar that moves with TWIST; the stamp is the middle."""
     seconds = (stamp_us - FIRST_US) / 1e6 + (np.arange(400) / 400 - 0.5) * 0.05
     poses = exp(TWIST, seconds)
-    local = np.stack([relative_pose(p, np.array([x, y, 0.0])) for p, (x, y, _) in zip(poses, PLACES, strict=True)])
+    local = np.stack(
+        [relative_pose(p, np.array([x, y, 0.0])) for p, (x, y, _) in zip(poses, PLACES, strict=True)]
+    )
     local[:, 2] = np.where(np.arange(400) % 4 == 0, -2.0, 0.5)  # each fourth point is on the ground
     points = transform_points_3d(T_LIDAR_RADAR, local) * (1, -1, -1)
     rows = np.vstack([points.T, np.full(400, 7.0)]).astype("<f4")
@@ -80,7 +82,11 @@ def test_sweeps_near_a_scan_are_left_out(root: Path) -> None:
     kept = real_submap.build_submap(sweeps, [middle], 0.9, min_hits=1)
     late = real_submap.build_submap(
         real_submap.PlacedSweeps(
-            sweeps.stamps_us[18:], sweeps.clouds[18:], sweeps.poses[18:], sweeps.odometry_stamps_us, sweeps.odometry_poses
+            sweeps.stamps_us[18:],
+            sweeps.clouds[18:],
+            sweeps.poses[18:],
+            sweeps.odometry_stamps_us,
+            sweeps.odometry_poses,
         ),
         min_hits=1,
     )
@@ -92,7 +98,9 @@ def test_sweeps_near_a_scan_are_left_out(root: Path) -> None:
 def test_sweeps_outside_the_odometry_are_named(root: Path) -> None:
     listing = root / real_submap.SWEEPS_PATH / "velodyne_left.timestamps"
     listing.write_text(f"{FIRST_US + 60_000_000} 1\n", encoding="utf-8")
-    with pytest.raises(real_submap.SubmapError, match=r"radar_odometry.csv: covers \d+ .. \d+ us, but the sweeps are"):
+    with pytest.raises(
+        real_submap.SubmapError, match=r"radar_odometry.csv: covers \d+ .. \d+ us, but the sweeps are"
+    ):
         real_submap.load_placed_sweeps(root)
 
 
@@ -114,5 +122,22 @@ def test_a_listed_sweep_at_fault_is_named(root: Path) -> None:
 def test_points_are_free_where_the_lidar_saw_past_them() -> None:
     wall = np.column_stack([np.full(200, 20.0), np.linspace(-10.0, 10.0, 200)])
     points = np.array([[10.0, 0.3], [20.2, 0.3], [25.0, 0.3], [-10.0, 0.3]])  # gone, there, hidden, no return
-    counts = real_submap.find_free_points(points, [wall, wall], np.zeros((2, 3)))
+    counts = real_submap.count_sightings(points, [wall, wall], np.zeros((2, 3)))
     np.testing.assert_array_equal(counts, [[2, 0], [0, 2], [0, 0], [0, 0]])
+
+
+def test_changes_near_the_path() -> None:
+    wall = np.column_stack([np.full(200, 20.0), np.linspace(-10.0, 10.0, 200)])
+    car, old_car, far = np.array([[15.0, 9.0]]), np.array([[10.0, 0.3]]), np.array([[200.0, 0.0]])
+    sweeps, poses = [np.vstack([wall, car])] * 2, np.zeros((2, 3))
+    changes = real_submap.find_changes(np.vstack([wall, car]), np.vstack([wall, old_car, far]), sweeps, poses)
+    np.testing.assert_array_equal(changes.new, car)
+    np.testing.assert_array_equal(changes.gone, old_car)
+    assert len(changes.same) == 200 and len(changes.confirmed) + len(changes.hidden) == 200
+    assert len(changes.hidden) < 12  # the wall behind the new car
+
+
+def test_the_right_rotation_is_the_sharpest(root: Path) -> None:
+    sweeps = real_submap.load_placed_sweeps(root)
+    counts = real_submap.measure_sharpness(sweeps, np.deg2rad([-3.0, 0.0, 3.0]), every=3)
+    assert counts.argmin() == 1 and counts.max() > 1.2 * counts.min()
