@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 
 from rol.geometry import compose, exp, invert, log, relative_pose, transform_points, transform_points_3d
 from rol.lidar import crop_range, remove_ground
-from rol.maps import Registration, register_maps
+from rol.maps import thin_points
 from rol.pix2pix import TrainedNetwork
 from rol.radar import MEASURED, RangeCalibration
 from rol.similarity import fraction_within, nn_distances
@@ -24,8 +24,8 @@ from rol_study.real_scans import WRONG_HEADINGS, Generate, front_end_points
 
 OFFSETS_M = (-0.6, -0.45, MEASURED.offset_m, -0.15, 0.0)  # that are compared [m]
 OFFSET_M = MEASURED.offset_m  # of the ranges, as on Oxford's radar; the data set states none [m]
-# Stages of `rol.maps.register_maps` for a single cloud near its pose: all points at once, from 6 m down.
-CLOUD_STAGES = ((np.inf, 6.0, 2.0, 0.5), (np.inf, 2.0, 0.5, 0.25))
+STARTS_M = (-1.5, 0.0, 1.5)  # along the vehicle, of the fits to the map [m]
+MAP_SIGMA_M = 0.4  # of these fits [m]
 
 
 def keyframe_points(path: Path | str, max_range_m: float = 100.0) -> np.ndarray:
@@ -74,54 +74,40 @@ def evaluate_on_keyframe(points: Mapping[str, np.ndarray], keyframe: np.ndarray)
     return pd.DataFrame(rows)
 
 
-def fit_radar(points: np.ndarray, keyframe: np.ndarray, sigma_m: float = 0.3) -> tuple[np.ndarray, float]:
-    """Fit radar points to a keyframe by a rigid motion near zero: what the calibration leaves.
+def fit_cloud(
+    points: np.ndarray,
+    reference: np.ndarray,
+    sigma_m: float = 0.3,
+    start: tuple[float, float, float] = (0.0, 0.0, 0.0),
+) -> tuple[np.ndarray, float]:
+    """Fit points to reference points by a small rigid motion.
 
     Parameters
     ----------
-    points, keyframe : array, shape (n, 2) and (m, 2)
-        Points of radar and lidar in the radar frame of the calibration [m].
+    points, reference : array, shape (n, 2) and (m, 2)
+        Points [m].
     sigma_m : float
         Standard deviation of the Gaussian of the distances that is maximized [m].
+    start : tuple of float
+        Initial guess of the motion [m, m, rad].
 
     Returns
     -------
     motion : array, shape (3,)
-        Motion of the radar points (forward, left, counter-clockwise) [m, m, rad].
+        Motion of the points (forward, left, counter-clockwise) [m, m, rad].
     score : float
-        Mean Gaussian of the distances to the keyframe, 0..1.
+        Mean Gaussian of the distances to the reference, 0..1.
     """
-    tree = cKDTree(keyframe)
+    tree = cKDTree(reference)
 
     def cost(motion: np.ndarray) -> float:
-        away = tree.query(transform_points(motion, points), distance_upper_bound=10.0 * sigma_m)[0]
+        away = tree.query(transform_points(motion, points), distance_upper_bound=5.0 * sigma_m)[0]
         return -float(np.mean(np.exp(-0.5 * (away / sigma_m) ** 2)))
 
-    simplex = np.vstack([np.zeros(3), np.diag([0.3, 0.3, 0.01])])
+    simplex = np.asarray(start) + np.vstack([np.zeros(3), np.diag([0.3, 0.3, 0.01])])
     options = {"initial_simplex": simplex, "xatol": 1e-3, "fatol": 1e-4}
-    found = minimize(cost, np.zeros(3), method="Nelder-Mead", options=options)
+    found = minimize(cost, simplex[0], method="Nelder-Mead", options=options)
     return found.x, -float(found.fun)
-
-
-def register_cloud(cloud: np.ndarray, map_points: np.ndarray, pose: np.ndarray) -> Registration:
-    """Register one cloud to the surroundings of a pose, see `rol.maps.register_maps`.
-
-    Parameters
-    ----------
-    cloud : array, shape (n, 2)
-        Points in the radar frame [m].
-    map_points : array, shape (m, 2)
-        Points of the map [m].
-    pose : array, shape (3,)
-        Initial guess T_map_radar [m, m, rad].
-
-    Returns
-    -------
-    registration : Registration
-        ``T_target_source`` is T_map_radar.
-    """
-    near = map_points[np.abs(map_points - pose[:2]).max(axis=1) < 150.0]
-    return register_maps(cloud, near, pose, stages=CLOUD_STAGES)
 
 
 def poses_at(poses: np.ndarray, first_s: float, seconds: np.ndarray, period_s: float = 0.25) -> np.ndarray:
@@ -157,10 +143,10 @@ def poses_at(poses: np.ndarray, first_s: float, seconds: np.ndarray, period_s: f
     return compose(poses[before], exp(increments, np.clip(rows - before, 0.0, 1.0)))
 
 
-def find_pose_frame(
-    clouds: Sequence[np.ndarray], poses: np.ndarray, map_points: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Find where the radar is in the frame of published poses: register lidar clouds to the map.
+def find_pose_frame(clouds: Sequence[np.ndarray], poses: np.ndarray, map_points: np.ndarray) -> np.ndarray:
+    """Find where the radar is in the frame of published poses: fit lidar clouds to the map.
+
+    A street hardly constrains the position along it, so the fit begins at several positions and the best one counts.
 
     Parameters
     ----------
@@ -175,12 +161,14 @@ def find_pose_frame(
     -------
     T_pose_radar : array, shape (k, 3)
         Pose of the radar in the frame of each published pose [m, m, rad].
-    fraction_1m : array, shape (k,)
-        Fraction of each cloud within 1 m of the map.
     """
-    found = [register_cloud(cloud, map_points, pose) for cloud, pose in zip(clouds, poses, strict=True)]
-    placed = np.array([registration.T_target_source for registration in found])
-    return relative_pose(poses, placed), np.array([registration.fraction_1m for registration in found])
+    frames = []
+    for cloud, pose in zip(clouds, poses, strict=True):
+        around = crop_range(transform_points(invert(pose), map_points), 110.0)
+        thinned = thin_points(cloud, 0.5)[0]
+        fits = [fit_cloud(thinned, around, MAP_SIGMA_M, (forward, 0.0, 0.0)) for forward in STARTS_M]
+        frames.append(max(fits, key=lambda fit: fit[1])[0])
+    return np.array(frames)
 
 
 @dataclass(frozen=True, eq=False)
@@ -194,7 +182,7 @@ class MulranStudy:
     keyframe : array, shape (m, 2)
         Lidar points of the same moment in the radar frame [m].
     map_points : array, shape (k, 2)
-        Points of the map in the radar frame at the pose of the registered keyframe [m].
+        Points of the map in the radar frame at the pose of the fitted keyframe [m].
     precision : pandas.DataFrame
         By front end, means over the scans: `evaluate_on_keyframe`, and ``share_1m_map``, ``share_2m_map``,
         ``chance_1m_map``, ``chance_2m_map`` on the map.
@@ -222,7 +210,7 @@ def fit_range_offsets(
         calibration = RangeCalibration(mulran.RANGE_RESOLUTION, offset)
         for scan in scans:
             peaks = detect_points(scan.power, scan.azimuths, calibration=calibration)
-            motion, score = fit_radar(peaks, keyframe)
+            motion, score = fit_cloud(peaks, keyframe)
             moved = {"forward_m": motion[0], "left_m": motion[1], "turn_deg": np.rad2deg(motion[2])}
             rows.append({"offset_m": offset, "score": score, **moved})
     return pd.DataFrame(rows).groupby("offset_m").mean()
@@ -261,12 +249,12 @@ def evaluate_mulran(
     map_points = mulran.load_kaist_map(real_root)
     poses = rall.load_poses(Path(real_root) / mulran.KAIST_POSES_PATH)
     published = poses_at(poses, scans[0].row_stamps_ns.mean() / 1e9, seconds[::every])
-    frame, _ = find_pose_frame(keyframes, published, map_points)
+    frame = find_pose_frame(keyframes, published, map_points)
     near = transform_points(invert(compose(published[0], frame[0])), map_points)
     near = crop_range(near, 150.0)
     on_keyframe = pd.concat([evaluate_on_keyframe(found, keyframes[0]) for found in points])
     on_map = pd.concat([evaluate_on_keyframe(found, near) for found in points])
     means = [table.groupby("points", sort=False).mean() for table in (on_keyframe, on_map)]
-    precision = means[0].join(means[1].drop(columns=["n", "reached_1m"]), rsuffix="_map")
+    precision = means[0].join(means[1].drop(columns=["n", "reached_1m"]).add_suffix("_map"))
     offsets = fit_range_offsets(scans, keyframes[0], OFFSETS_M)
     return MulranStudy(points, keyframes[0], near, precision, frame, offsets)

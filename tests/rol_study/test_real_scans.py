@@ -26,7 +26,9 @@ def make_scan(stamp_us: int = 1) -> RealScan:
 
 def make_network(**points: object) -> SimpleNamespace:
     """What `evaluate_front_ends` reads of a network."""
-    return SimpleNamespace(points={"threshold": 128, "thin": True, **points}, generator=SimpleNamespace(tta_rotations=4))
+    return SimpleNamespace(
+        points={"threshold": 128, "thin": True, **points}, generator=SimpleNamespace(tta_rotations=4)
+    )
 
 
 def generate(network, power, azimuths, twist=None, tta_rotations=4):
@@ -49,7 +51,11 @@ def test_every_front_end_of_every_scan_is_a_row() -> None:
     fronts = ["raw", "cfar", "paper", "unet", "unet, not thinned", "unet, one heading"]
     assert table["points"].tolist() == fronts * 2 and table.timestamp_us.tolist() == [1] * 6 + [2] * 6
     counts = table.set_index("points").n
-    assert (counts["unet"] == 4).all() and (counts["unet, one heading"] == 1).all() and (counts["raw"] == 1).all()
+    assert (
+        (counts["unet"] == 4).all()
+        and (counts["unet, one heading"] == 1).all()
+        and (counts["raw"] == 1).all()
+    )
     assert len(results) == 2 and results[0][0] is not None
     empty, none = real_scans.evaluate_front_ends([], networks, "unet", cKDTree(WALL), generate)
     assert none == [] and list(empty.columns) == list(table.columns)
@@ -85,7 +91,9 @@ def test_starts_are_off_in_all_directions_with_both_turns() -> None:
 def test_errors_are_metres_and_degrees() -> None:
     poses = np.array([[[3.0, 4.0, 0.1], [0.0, 0.0, -np.pi]], [[0.0, 0.0, 0.0], [0.0, 0.0, np.pi]]])
     errors = real_scans.position_and_heading_errors(poses, np.array([[0.0, 0.0, 0.0], [0.0, 0.0, np.pi]]))
-    np.testing.assert_allclose(errors, [[[5.0, np.rad2deg(0.1)], [0.0, 0.0]], [[0.0, 0.0], [0.0, 0.0]]], atol=1e-9)
+    np.testing.assert_allclose(
+        errors, [[[5.0, np.rad2deg(0.1)], [0.0, 0.0]], [[0.0, 0.0], [0.0, 0.0]]], atol=1e-9
+    )
 
 
 def test_runs_are_judged_from_a_scan_on() -> None:

@@ -68,7 +68,7 @@ def test_sweeps_lie_where_they_were_recorded(root: Path) -> None:
     np.testing.assert_allclose(sweeps.poses, exp(TWIST, 0.05 * np.arange(20)), atol=1e-9)
     np.testing.assert_allclose(sweeps.scan_poses([FIRST_US + 125_000]), [exp(TWIST, 0.05)], atol=1e-9)
     submap = real_submap.build_submap(sweeps)
-    assert len(submap) > 150 and np.mean(distances_to_places(submap) < 0.001) > 0.95
+    assert len(submap) > 150 and np.mean(distances_to_places(submap) < 0.001) > 0.9
     assert len(sweeps.clouds[3]) < 301  # the ground is removed
 
 
