@@ -164,7 +164,7 @@ def draw_scans_as_in_paper(
     figure, axes = plt.subplots(len(results), 4, figsize=size, width_ratios=widths, dpi=80, squeeze=False)
     images = [[clean(radar_image), generated] for _, radar_image, generated in results]
     plots.draw_image_grid(
-        axes[:, :2], images, ("real radar", "fake lidar"), labels, half=50.0, vmax=(70, 255)
+        axes[:, :2], images, ("real radar", "generated"), labels, half=50.0, vmax=(70, 255)
     )
     for row, (points, _, _), pose in zip(axes, results, poses, strict=True):
         placed = transform_points(pose, points)

@@ -314,6 +314,12 @@ def find_changes(
     return Changes(submap[~is_new], submap[is_new], map_points[is_there], map_points[is_gone], hidden)
 
 
+def sharpest_angle(angles: np.ndarray, counts: np.ndarray) -> float:
+    """Find the minimum of the parabola through the counts of `measure_sharpness`, in the unit of the angles."""
+    square, slope, _ = np.polyfit(angles, counts, 2)
+    return float(-slope / (2.0 * square))
+
+
 def measure_sharpness(
     sweeps: PlacedSweeps, angles: np.ndarray, every: int = 8, cell: float = 0.25
 ) -> np.ndarray:

@@ -1,11 +1,12 @@
 """A submap of sweeps along an odometry: places, motion, what is left out, and sweeps that cannot be placed."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from rol.geometry import exp, relative_pose, transform_points_3d
+from rol.geometry import compose, exp, relative_pose, transform_points, transform_points_3d
 from rol.lidar import relate_sensors
 from rol.oxford import EXTRINSICS, ODOMETRY_COLUMNS, OxfordError
 from rol_data.rall import SCANS_PATH
@@ -13,7 +14,9 @@ from rol_study import real_submap
 
 FIRST_US, TWIST = 1_547_131_046_000_000, np.array([8.0, 0.0, 0.2])
 T_LIDAR_RADAR = np.linalg.inv(relate_sensors(EXTRINSICS["radar"], EXTRINSICS["velodyne_left"]))
-PLACES = np.column_stack([np.linspace(-30.0, 60.0, 400), np.repeat([9.0, -9.0], 200), np.zeros(400)])
+WALLS = [np.column_stack([np.linspace(-30.0, 60.0, 140), np.full(140, y)]) for y in (9.0, -9.0)]
+WALLS += [np.column_stack([np.full(40, x), np.linspace(9.4, 29.4, 40)]) for x in (-12.0, 17.3, 41.1)]
+PLACES = np.column_stack([np.vstack(WALLS), np.zeros(400)])
 
 
 def write_odometry(root: Path, n: int = 9) -> None:
@@ -139,5 +142,33 @@ def test_changes_near_the_path() -> None:
 
 def test_the_right_rotation_is_the_sharpest(root: Path) -> None:
     sweeps = real_submap.load_placed_sweeps(root)
-    counts = real_submap.measure_sharpness(sweeps, np.deg2rad([-3.0, 0.0, 3.0]), every=3)
-    assert counts.argmin() == 1 and counts.max() > 1.2 * counts.min()
+    angles = np.array([-2.0, -1.0, 0.0, 1.0, 2.0])
+    counts = real_submap.measure_sharpness(sweeps, np.deg2rad(angles), every=3)
+    assert counts.argmin() == 2 and counts.max() > 1.2 * counts.min()
+    assert abs(real_submap.sharpest_angle(angles, counts)) < 0.3
+
+
+def test_segments_registered_alone_show_an_error_of_the_odometry(root: Path) -> None:
+    sweeps = real_submap.load_placed_sweeps(root)
+    target, moved = real_submap.build_submap(sweeps, min_hits=1), sweeps.poses.copy()
+    moved[10:, 1] -= 0.5  # the second half is placed half a metre to the right
+    sweeps = replace(sweeps, poses=moved)
+    table = real_submap.register_segments(sweeps, target, np.zeros(3), [0, 10, 20])
+    assert table["first"].tolist() == [0, 10] and table["last"].tolist() == [9, 19]
+    np.testing.assert_allclose(table.speed_mps, 8.0, atol=0.1)
+    np.testing.assert_allclose(np.hypot(table.forward_m, table.left_m), [0.0, 0.5], atol=0.1)
+
+
+def test_a_submap_is_registered_from_several_starts(root: Path) -> None:
+    truth = np.array([30.0, -5.0, 0.4])
+    sweeps = real_submap.load_placed_sweeps(root)
+    target = transform_points(truth, real_submap.build_submap(sweeps))
+    stamps = sweeps.odometry_stamps_us[1:4].tolist()
+    poses = compose(truth, sweeps.scan_poses(stamps))
+    poses[:, 1] += 0.3
+    offsets = np.array([[1.0, 0.5, 0.02], [-1.0, 0.5, -0.02]])
+    found = real_submap.register_submap(root, stamps, poses, target, offsets)
+    np.testing.assert_allclose(found.T_map_submap, truth, atol=0.05)
+    assert found.spread_m < 0.05 and found.residuals_m.max() < 0.3
+    np.testing.assert_allclose(found.differences[:, 2], 0.3, atol=0.05)
+    np.testing.assert_allclose(found.path[0], truth, atol=0.05)
