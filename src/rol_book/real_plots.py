@@ -163,9 +163,7 @@ def draw_scans_as_in_paper(
     size, widths = (9.6, 2.3 * len(results)), (1, 1, 1, 1.15)
     figure, axes = plt.subplots(len(results), 4, figsize=size, width_ratios=widths, dpi=80, squeeze=False)
     images = [[clean(radar_image), generated] for _, radar_image, generated in results]
-    plots.draw_image_grid(
-        axes[:, :2], images, ("real radar", "generated"), labels, half=50.0, vmax=(70, 255)
-    )
+    plots.draw_image_grid(axes[:, :2], images, ("real radar", "generated"), labels, half=50.0, vmax=(70, 255))
     for row, (points, _, _), pose in zip(axes, results, poses, strict=True):
         placed = transform_points(pose, points)
         away = map_tree.query(placed)[0]
@@ -332,16 +330,13 @@ def draw_submap(
     -------
     figure : Figure
     """
-    figure = plt.figure(figsize=(9.6, 4.6), dpi=100)
-    first, second, third = figure.subfigures(1, 3, width_ratios=(1, 1, 0.72))
+    figure, (ax, other, last) = plt.subplots(1, 3, figsize=(9.6, 3.9), dpi=100, width_ratios=(1, 1, 0.8))
     middle = path[:, :2].mean(axis=0)
-    size = (np.ptp(path[:, :2], axis=0).max() / 2.0 + 32.0) * 1.0
-    ax = first.subplots()
+    size = np.ptp(path[:, :2], axis=0).max() / 2.0 + 30.0
     plots.show_points(ax, crop(map_points, middle, size), colour=COLOURS["map"], size=1.5, label="map")
-    plots.show_points(ax, crop(submap, middle, size), colour=COLOURS["real"], size=1.0, label="submap")
+    plots.show_points(ax, crop(submap, middle, size), colour=COLOURS["real"], size=0.7, label="submap")
     plots.draw_track(ax, path, colour=COLOURS["truth"])
     ax.set_title("registered")
-    other = second.subplots()
     kinds = {"same": "#C9C9C9", "confirmed": "#C9C9C9", "hidden": "#E9E9E9"}
     for kind, colour in kinds.items():
         plots.show_points(other, getattr(changes, kind), colour=colour, size=1.0)
@@ -352,7 +347,6 @@ def draw_submap(
     for axes in (ax, other):
         plots.zoom(axes, middle, size)
         axes.legend(loc="upper left", markerscale=4, frameon=True, fontsize=8.5)
-    last = third.subplots()
     last.plot(sharpness[0], sharpness[1] / 1000.0, "o-", color=COLOURS["real"])
     last.axvline(0.0, color="#444444", linewidth=0.9, linestyle="--")
     last.set(title="sharpness", xlabel="rotation of the sweeps [deg]", ylabel="occupied cells [thousands]")

@@ -7,6 +7,7 @@ Frames: x forward, y left, z up [m], except for the lidar, which faces backward.
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,6 +18,8 @@ from rol.files import read_text
 from rol.geometry import transform_from_euler
 from rol.oxford import COUNTS_PER_TURN
 from rol_data import rall
+
+os.environ.setdefault("OPEN3D_DISABLE_WEB_VISUALIZER", "true")  # it prints when it is imported
 
 SCANS_PATH = Path("referee/cpp/examples")  # this and the others: below the folder of the real data
 KEYFRAMES_PATH = Path("SC-A-LOAM/utils/sample_data/KAIST03")

@@ -24,6 +24,7 @@ from rol_study.real_scans import WRONG_HEADINGS, Generate, front_end_points
 
 OFFSETS_M = (-0.6, -0.45, MEASURED.offset_m, -0.15, 0.0)  # that are compared [m]
 OFFSET_M = MEASURED.offset_m  # of the ranges, as on Oxford's radar; the data set states none [m]
+MIN_HEIGHT_M = -1.0  # of lidar points, in the radar frame: the street rises ahead of the vehicle [m]
 STARTS_M = (-1.5, 0.0, 1.5)  # along the vehicle, of the fits to the map [m]
 MAP_SIGMA_M = 0.4  # of these fits [m]
 
@@ -44,7 +45,7 @@ def keyframe_points(path: Path | str, max_range_m: float = 100.0) -> np.ndarray:
         Points in the radar frame [m].
     """
     cloud = transform_points_3d(mulran.radar_from_lidar(), mulran.load_cloud(path))
-    return crop_range(remove_ground(cloud), max_range_m, MIN_RANGE_M)[:, :2]
+    return crop_range(remove_ground(cloud, MIN_HEIGHT_M), max_range_m, MIN_RANGE_M)[:, :2]
 
 
 def evaluate_on_keyframe(points: Mapping[str, np.ndarray], keyframe: np.ndarray) -> pd.DataFrame:

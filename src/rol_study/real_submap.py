@@ -35,6 +35,7 @@ from rol_data.rall import SCANS_PATH
 SWEEPS_PATH = Path("oxford_car_visualiser2/data")  # below the folder of the real data
 SENSOR = "velodyne_left"
 SWEEP_SECONDS = 0.05  # one turn of the HDL-32E
+MIN_HITS = 20  # sweeps that must hit a cell: those of one second, longer than a moving vehicle covers it
 # Stages of `rol.maps.register_maps` for a segment near its place.
 SEGMENT_STAGES = ((np.inf, 2.0, 0.5, 0.25), (np.inf, 1.0, 0.3, 0.25))
 STAMP_POSITION = 0.5  # of a sweep's stamp within its turn: 0 the beginning, 1 the end
@@ -186,7 +187,7 @@ def build_submap(
     gap_s: float = 1.0,
     *,
     cell: float = 0.25,
-    min_hits: int = 3,
+    min_hits: int = MIN_HITS,
 ) -> np.ndarray:
     """Accumulate sweeps into a submap.
 
@@ -428,6 +429,7 @@ def register_submap(
     poses: np.ndarray,
     map_points: np.ndarray,
     offsets: np.ndarray,
+    min_hits: int = MIN_HITS,
 ) -> RegisteredSubmap:
     """Accumulate all sweeps, register the submap from several starts, and compare it with given poses.
 
@@ -443,6 +445,8 @@ def register_submap(
         Points of the map around them [m].
     offsets : array, shape (k, 3)
         Starts in the frame of the first pose [m, m, rad].
+    min_hits : int
+        As in `build_submap`.
 
     Returns
     -------
@@ -454,7 +458,7 @@ def register_submap(
         If the odometry does not cover the sweeps or has no pose for a scan.
     """
     sweeps = load_placed_sweeps(real_root)
-    submap, own = build_submap(sweeps), sweeps.scan_poses(stamps_us)
+    submap, own = build_submap(sweeps, min_hits=min_hits), sweeps.scan_poses(stamps_us)
     starts = compose(compose(poses[0], offsets), invert(own[0]))
     found = np.array([register_maps(submap, map_points, start).T_target_source for start in starts])
     path = to_first_map(found[0], sweeps.poses)

@@ -70,13 +70,13 @@ def test_sweeps_lie_where_they_were_recorded(root: Path) -> None:
     assert len(sweeps.clouds) == len(sweeps.poses) == 20  # the file that is not listed is not among them
     np.testing.assert_allclose(sweeps.poses, exp(TWIST, 0.05 * np.arange(20)), atol=1e-9)
     np.testing.assert_allclose(sweeps.scan_poses([FIRST_US + 125_000]), [exp(TWIST, 0.05)], atol=1e-9)
-    submap = real_submap.build_submap(sweeps)
+    submap = real_submap.build_submap(sweeps, min_hits=3)
     assert len(submap) > 150 and np.mean(distances_to_places(submap) < 0.001) > 0.9
     assert len(sweeps.clouds[3]) < 301  # the ground is removed
 
 
 def test_the_position_of_the_stamp_matters(root: Path) -> None:
-    submap = real_submap.build_submap(real_submap.load_placed_sweeps(root, stamp_position=0.0))
+    submap = real_submap.build_submap(real_submap.load_placed_sweeps(root, stamp_position=0.0), min_hits=3)
     assert 0.1 < np.median(distances_to_places(submap)) < 0.3  # half a sweep at 8 m/s
 
 
@@ -162,12 +162,12 @@ def test_segments_registered_alone_show_an_error_of_the_odometry(root: Path) -> 
 def test_a_submap_is_registered_from_several_starts(root: Path) -> None:
     truth = np.array([30.0, -5.0, 0.4])
     sweeps = real_submap.load_placed_sweeps(root)
-    target = transform_points(truth, real_submap.build_submap(sweeps))
+    target = transform_points(truth, real_submap.build_submap(sweeps, min_hits=3))
     stamps = sweeps.odometry_stamps_us[1:4].tolist()
     poses = compose(truth, sweeps.scan_poses(stamps))
     poses[:, 1] += 0.3
     offsets = np.array([[1.0, 0.5, 0.02], [-1.0, 0.5, -0.02]])
-    found = real_submap.register_submap(root, stamps, poses, target, offsets)
+    found = real_submap.register_submap(root, stamps, poses, target, offsets, min_hits=3)
     np.testing.assert_allclose(found.T_map_submap, truth, atol=0.05)
     assert found.spread_m < 0.05 and found.residuals_m.max() < 0.3
     np.testing.assert_allclose(found.differences[:, 2], 0.3, atol=0.05)
