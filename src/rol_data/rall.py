@@ -25,6 +25,8 @@ MAP_PATH = Path("RaLL/data/maps/RobotCar/png/oxford_laser_map.png")
 POSES_PATH = Path("RaLL/data/gt_poses/RobotCar")
 ODOMETRY_PATH = Path("RaLL/data/odom/RobotCar")
 SCANS_PATH = Path("RadarSLAMPy/data/tiny")
+POSED_SCANS_PATH = Path("radar-localization/test")  # scans of session 01, whose ground truth is published
+SESSION_01_PATH = Path("RadarSLAMPy/data/full_seq_1")  # official odometry of session 01
 SCAN_POSES_PATH = Path("oxford_scan_map_poses.csv")  # in no public repository, so it comes with the book
 MAP_CELL = 0.25  # side of a pixel of the map [m]
 # Of the published image; x at the upper edge of the first row, y at the left edge of the first column [m].
@@ -353,6 +355,48 @@ def load_scans(real_root: Path | str) -> list[RealScan]:
         scan = load_radar(path)
         scans.append(RealScan(path, stamp, scan.power, scan.azimuths, poses[stamp], twists.get(stamp)))
     return scans
+
+
+def load_posed_scans(real_root: Path | str) -> list[RealScan]:
+    """Read the real radar scans of session 01, whose poses on the map are published.
+
+    Parameters
+    ----------
+    real_root : path
+        Folder of the real data, see `find_real_root`.
+
+    Returns
+    -------
+    scans : list of RealScan
+        Every scan under ``radar-localization/test`` in the order of time, none if there is none. Row i of
+        ``pose_xy_01.txt`` is the pose of scan i of the official odometry, at mid-scan; the velocity is that of the
+        official odometry.
+
+    Raises
+    ------
+    RallError
+        If a scan is not in the odometry, or has no row in the ground truth.
+    rol.oxford.OxfordError
+        If a scan or the odometry is at fault.
+    """
+    paths = sorted((Path(real_root) / POSED_SCANS_PATH).glob("[!.]*.png"))
+    if not paths:
+        return []
+    odometry = load_radar_odometry(Path(real_root) / SESSION_01_PATH / "gt" / "radar_odometry.csv")
+    stamps, twists = compose_odometry(odometry)[0], estimate_twists(odometry)
+    poses_path = Path(real_root) / POSES_PATH / "pose_xy_01.txt"
+    poses, found = load_poses(poses_path), []
+    for path in paths:
+        scan = load_radar(path)
+        (rows,) = np.nonzero(stamps == scan.stamp_us)
+        if len(rows) == 0:
+            raise RallError(f"{path}: the scan is not in {odometry.path}")
+        if rows[0] >= len(poses):
+            raise RallError(f"{poses_path}: has {len(poses)} rows, none for scan {rows[0]} ({path.name})")
+        twist = tuple(float(value) for value in twists[rows[0]])
+        pose = poses[rows[0]]
+        found.append(RealScan(path, scan.stamp_us, scan.power, scan.azimuths, pose, twist))
+    return found
 
 
 def group_scans(stamps_us: Sequence[int], max_gap_s: float = 1.0) -> list[list[int]]:

@@ -206,3 +206,43 @@ def test_faulty_maps_and_scan_poses_are_named(tmp_path: Path) -> None:
         table.write_text(f"timestamp_us,x_m,y_m,yaw_rad\n{row}\n", encoding="utf-8")
         with pytest.raises(rall.RallError, match=fault):
             rall.load_scan_poses(table)
+
+
+def copy_posed_scan(real_root: Path, root: Path, n_poses: int, n_increments: int) -> str:
+    """Link the scan of session 01 into another folder, with shortened ground truth and odometry; its name."""
+    paths = sorted((real_root / rall.POSED_SCANS_PATH).glob("*.png"))
+    if not paths:
+        pytest.skip("no scan with a published pose under ROL_REAL_ROOT: run `make real`")
+    for folder in (rall.POSED_SCANS_PATH, rall.SESSION_01_PATH / "gt", rall.POSES_PATH):
+        (root / folder).mkdir(parents=True)
+    (root / rall.POSED_SCANS_PATH / paths[0].name).symlink_to(paths[0].resolve())
+    lengths = {rall.POSES_PATH / "pose_xy_01.txt": n_poses}
+    lengths[rall.SESSION_01_PATH / "gt" / "radar_odometry.csv"] = 1 + n_increments
+    for name, n in lengths.items():
+        lines = (real_root / name).read_text(encoding="utf-8").splitlines(keepends=True)
+        (root / name).write_text("".join(lines[:n]), encoding="utf-8")
+    return paths[0].name
+
+
+def test_a_scan_with_a_published_pose(real_root: Path, tmp_path: Path) -> None:
+    name = copy_posed_scan(real_root, tmp_path, 700, 700)
+    [scan] = rall.load_posed_scans(tmp_path)
+    assert f"{scan.stamp_us}.png" == name == "1547120953445209.png"
+    np.testing.assert_allclose(scan.pose, [474.22136, -38.90319, 1.84825], atol=1e-5)  # row 663
+    assert np.rad2deg(scan.twist[2]) * 0.25 == pytest.approx(8.0, abs=0.5)  # per scan
+    assert rall.load_posed_scans(tmp_path / "nowhere") == []
+
+
+@pytest.mark.parametrize(
+    ("n_poses", "n_increments", "fault"),
+    [
+        (663, 700, "pose_xy_01.txt: has 663 rows, none for scan 663 .1547120953445209.png."),
+        (700, 600, "1547120953445209.png: the scan is not in .*radar_odometry.csv"),
+    ],
+)
+def test_a_scan_without_a_published_pose_is_named(
+    real_root: Path, tmp_path: Path, n_poses: int, n_increments: int, fault: str
+) -> None:
+    copy_posed_scan(real_root, tmp_path, n_poses, n_increments)
+    with pytest.raises(rall.RallError, match=fault):
+        rall.load_posed_scans(tmp_path)
