@@ -251,8 +251,8 @@ def load_scans(real_root: Path | str) -> list[RealScan]:
 class RadarImages(Sequence):
     """Cartesian radar images of a session with their poses, read one by one.
 
-    Image k is ``<k + 1>.png``, shape (512, 512), uint8: x points up and y to the left, 0.25 m per pixel, power in half-dB
-    steps as the data set's SDK resamples it.
+    Image k is ``<k + 1>.png``, shape (512, 512), uint8: x points up and y to the left, 0.25 m per pixel,
+    power in half-dB steps as the data set's SDK resamples it.
 
     Attributes
     ----------
@@ -283,8 +283,8 @@ def load_radar_images(real_root: Path | str, number: str = "02") -> RadarImages:
     Parameters
     ----------
     real_root : path
-        Folder of the real data; the images are ``RaLL/radar_scans/seq<number>/<n>.png``, n from 1, one per row of
-        ``pose_xy_<number>.txt``.
+        Folder of the real data; the images are ``RaLL/radar_scans/seq<number>/<n>.png``, n from 1, one per
+        row of ``pose_xy_<number>.txt``.
     number : str
         Session.
 
@@ -296,8 +296,8 @@ def load_radar_images(real_root: Path | str, number: str = "02") -> RadarImages:
     Raises
     ------
     RallError
-        If the folder or the poses are missing, a number is missing, there are more images than poses, or an image has
-        another size or is not grey with 8 bits.
+        If the folder or the poses are missing, a number is missing, there are more images than poses, or an
+        image has another size or is not grey with 8 bits.
     """
     folder = Path(real_root, IMAGES_PATH, f"seq{number}")
     truth = load_poses(Path(real_root, POSES_PATH, f"pose_xy_{number}.txt"))
@@ -319,7 +319,8 @@ def load_radar_images(real_root: Path | str, number: str = "02") -> RadarImages:
 def image_to_scan(image: np.ndarray, stamp_us: int, calibration: RangeCalibration = SDK) -> RadarScan:
     """Resample a radar image into the polar scan from which it was made.
 
-    The networks of this book expect another range calibration and compensated motion; both are applied to polar scans.
+    The networks of this book expect another range calibration and compensated motion; both are applied to
+    polar scans.
 
     Parameters
     ----------
@@ -328,14 +329,15 @@ def image_to_scan(image: np.ndarray, stamp_us: int, calibration: RangeCalibratio
     stamp_us : int
         Time of the scan's first row [us].
     calibration : RangeCalibration
-        Range of the bins that the image was made with. The SDK's: the authors' odometry is 1.5 % short, as with this one.
+        Range of the bins that the image was made with. The SDK's: the authors' odometry is 1.5 % short, as
+        with this one.
 
     Returns
     -------
     scan : RadarScan
-        400 rows at the angles of Oxford's radar, with bins up to the image's corners; 0 outside the image. All rows are
-        flagged as interpolated. Bilinear; on the eleven real scans the points of the network `unet` hardly differ from
-        those of the scans as recorded (`book/oxford.md`).
+        400 rows at the angles of Oxford's radar, with bins up to the image's corners; 0 outside the image.
+        All rows are flagged as interpolated. Bilinear; on the eleven real scans the points of the network
+        `unet` hardly differ from those of the scans as recorded (`book/oxford.md`).
     """
     bearings = -2.0 * np.pi / 5600.0 * ROW_COUNTS[:, None]
     n_bins = int((IMAGE_WIDTH * IMAGE_PIXEL / np.sqrt(2.0) - calibration.offset_m) / calibration.resolution_m)

@@ -1,16 +1,17 @@
-"""The whole method on a session of real radar: scans, network, points, odometry and both filters on the real lidar map.
+"""The whole method on a session of real radar: network, points, odometry and both filters on the real map.
 
-Everything is read scan by scan, and the generated points, which cost nearly all of the time, are kept in files, so a run
-that was stopped goes on. Memory does not grow with the number of scans, but for the poses.
+Everything is read scan by scan, and the generated points, which cost nearly all of the time, are kept in
+files, so a run that was stopped goes on. Memory does not grow with the number of scans, but for the poses.
 
-There are two kinds of sessions. The radar images of the paper's Seq01 have ground truth in the frame of the map. A folder in
-Oxford's layout has official odometry in a frame of its own: the start is found by global localization, and the official
-trajectory is fitted rigidly to the estimate, to be compared with it.
+There are two kinds of sessions. The radar images of the paper's Seq01 have ground truth in the frame of the
+map. A folder in Oxford's layout has official odometry in a frame of its own: the start is found by global
+localization, and the official trajectory is fitted rigidly to the estimate, to be compared with it.
 """
 
 from __future__ import annotations
 
 import io
+import json
 import zlib
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -109,7 +110,7 @@ def open_images(real_root: Path | str, number: str = "02", max_scans: int = 0) -
 
 
 def open_oxford(folder: Path | str, max_scans: int = 0) -> RadarSession:
-    """Open the raw radar scans of a folder in Oxford's layout; lidars, GPS and a pose on the map are not needed.
+    """Open the raw radar scans of a folder in Oxford's layout, without lidar and without a pose on the map.
 
     Parameters
     ----------
@@ -178,7 +179,7 @@ class KeptClouds(Sequence):
         return points[ends[k - 1] if k else 0 : ends[k]].astype(np.float64)
 
     def write(self, first: int, clouds: list[np.ndarray], twists: np.ndarray) -> None:
-        """Write the clouds of one file whole or not at all, with the velocities that they were compensated for."""
+        """Write the clouds of one file whole or not at all, with the velocities used for compensation."""
         ends, file = np.cumsum([len(cloud) for cloud in clouds]), io.BytesIO()
         np.savez(file, points=np.concatenate(clouds).astype(np.float32), ends=ends, twists=twists)
         write_bytes(self.path(first), file.getvalue())
@@ -229,7 +230,7 @@ def keep_points(
     n = len(session.stamps_us)
     clouds = KeptClouds(folder, n)
     twists = np.full((n, 3), np.nan) if twists is None else twists
-    _clear_others(clouds.folder, {"session": session.name, "network": network.about, **options})
+    _clear_others(clouds.folder, {"session": session.name, "network": _describe(network), **options})
     todo = [k for k in range(0, n, CHUNK) if not clouds.holds(k, twists[k : k + CHUNK])]
     n_todo, n_done, begin = sum(min(CHUNK, n - k) for k in todo), 0, perf_counter()
     for first in todo:
@@ -238,10 +239,8 @@ def keep_points(
         clouds.write(first, made, own)
         n_done += len(own)
         seconds = (perf_counter() - begin) / n_done
-        left = (n_todo - n_done) * seconds / 60.0
-        report(
-            f"{clouds.folder.name} points: {first + len(own)} of {n} scans, {seconds:.2f} s each, {left:.0f} min left"
-        )
+        left = f"{(n_todo - n_done) * seconds / 60.0:.0f} min left"
+        report(f"{clouds.folder.name} points: {first + len(own)} of {n} scans, {seconds:.2f} s each, {left}")
     return clouds
 
 
@@ -254,18 +253,19 @@ def _generate(
 
 
 def _clear_others(folder: Path, about: dict[str, Any]) -> None:
-    """Remove points with another description from a folder, and describe those to come."""
-    marker, wanted = folder / "settings.json", {"points": _describe(about)}
-    if read_marker(marker) == wanted:
+    """Remove points that depend on anything else from a folder, and describe those to come."""
+    marker = folder / "settings.json"
+    if read_marker(marker) == about:
         return
     for path in folder.glob("[0-9]*.npz"):
         path.unlink()
-    write_text(marker, f'{{"points": "{wanted["points"]}"}}\n')
+    write_text(marker, json.dumps(about, indent=1) + "\n")
 
 
-def _describe(about: dict[str, Any]) -> str:
-    """Compute a checksum of what points depend on."""
-    return f"{zlib.crc32(repr(sorted(about.items())).encode()):08x}"
+def _describe(network: TrainedNetwork) -> str:
+    """Compute a checksum of a network with its threshold and the settings of its images."""
+    state, text = network.generator.state_dict(), repr((network.points, network.settings))
+    return f"{zlib.crc32(b''.join([text.encode(), *(v.numpy().tobytes() for v in state.values())])):08x}"
 
 
 @dataclass(frozen=True)
@@ -424,7 +424,7 @@ def run_robust(
     reference_contrast: float,
     report: Report = lambda line: None,
 ) -> Run:
-    """Run the robust filter without resets, from the true start or, where no truth is known, from anywhere on the map.
+    """Run the robust filter without resets; without ground truth it starts anywhere on the map.
 
     Parameters
     ----------
@@ -438,8 +438,8 @@ def run_robust(
     Returns
     -------
     run : Run
-        ``failures`` is empty, see `find_failures`. The motion model is not calibrated: `rol_beyond.motion.MotionModel` with
-        its wide noise.
+        ``failures`` is empty, see `find_failures`. The motion model is not calibrated:
+        `rol_beyond.motion.MotionModel` with its wide noise.
     """
     settings, rng = settings_for("robust", motion=MotionModel()), np.random.default_rng([seed, 2])
     corners = map_points.min(axis=0), map_points.max(axis=0)
@@ -468,7 +468,7 @@ class _Evened(Sequence):
 
 
 def measure_contrast(real_root: Path | str, network: TrainedNetwork, map_points: np.ndarray) -> float:
-    """Measure the reference contrast of a network on the real scans of another session, see `rol_data.rall.load_scans`.
+    """Measure the reference contrast of a network on the real scans of another session.
 
     Parameters
     ----------
@@ -482,7 +482,7 @@ def measure_contrast(real_root: Path | str, network: TrainedNetwork, map_points:
     Returns
     -------
     reference_contrast : float
-        Median over the eleven scans of 2019-01-10-14-36-48 at the poses fitted for this book.
+        Median over the eleven scans of `rol_data.rall.load_scans`, at the poses fitted for this book.
     """
     scans, grid = load_scans(real_root), settings_for("robust").measurement.build_grid(map_points)
     rng, poses = np.random.default_rng(0), np.array([scan.pose for scan in scans])
@@ -531,13 +531,14 @@ def fit_official(official: np.ndarray, run: Run, first: int, fraction: float = 0
     first : int
         First scan that counts.
     fraction : float
-        Fraction of the scans, the closest ones, on which the last fits are made, so that scans at which the filter was
-        lost hardly count.
+        Fraction of the scans, the closest ones, on which the last fits are made, so that scans at which the
+        filter was lost hardly count.
 
     Returns
     -------
     truth : array, shape (n, 3)
-        The trajectory in the frame of the map [m, m, rad]. A constant offset of the estimate cannot be seen with it.
+        The trajectory in the frame of the map [m, m, rad]. A constant offset of the estimate cannot be seen
+        with it.
     """
     source, target = official[first:], run.poses[first:, :2]
     chosen = np.flatnonzero(~run.is_lost[first:])
@@ -554,7 +555,7 @@ def with_fitted_truth(session: RadarSession, run: Run, first: int) -> RadarSessi
 
 
 def find_failures(stamps_us: np.ndarray, poses: np.ndarray, truth: np.ndarray) -> list[int]:
-    """Find the failures of a run without resets; one that lasts counts again each time that the rule is fulfilled."""
+    """Find the failures of a run without resets; one that lasts counts each time the rule is fulfilled."""
     monitor = FailureMonitor(stamps_us, truth, FailureRule())
     for index, pose in enumerate(poses):
         monitor(index, pose)

@@ -145,8 +145,8 @@ def write_radar_images(session: SimulatedSession, folder: Path | str) -> None:
     session : SimulatedSession
         From `build_segment`.
     folder : path
-        Where ``1.png``, ``2.png`` and so on are written: 512 x 512, 0.25 m per pixel, in the convention of the data set's
-        SDK. Images that are there already are kept.
+        Where ``1.png``, ``2.png`` and so on are written: 512 x 512, 0.25 m per pixel, in the convention of
+        the data set's SDK. Images that are there already are kept.
     """
     for index in range(len(session.scans_us)):
         path = Path(folder, f"{index + 1}.png")

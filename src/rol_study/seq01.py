@@ -1,7 +1,8 @@
 """The paper's Seq01 from real radar to Tables II and III: `python -m rol_study.seq01`, or `make seq01`.
 
-It reads the 8,618 radar images that the RaLL repository links, or with ``--session`` the raw scans of a folder in Oxford's
-layout, and writes trajectories and metrics of both methods. It can be stopped; the same command goes on.
+It reads the 8,618 radar images that the RaLL repository links, or with ``--session`` the raw scans of a
+folder in Oxford's layout, and writes trajectories and metrics of both methods. It can be stopped; the same
+command goes on.
 """
 
 from __future__ import annotations
@@ -12,7 +13,6 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
-import torch
 from scipy.spatial import cKDTree
 
 import rol_beyond.unet  # noqa: F401 (registers the architecture)
@@ -71,9 +71,8 @@ def run_session(
     first = 0
     if session.truth is None:
         first = end_to_end.find_start(robust)
-        report(
-            f"start found at scan {first + 1}, {(session.stamps_us[first] - session.stamps_us[0]) / 1e6:.0f} s"
-        )
+        seconds = (session.stamps_us[first] - session.stamps_us[0]) / 1e6
+        report(f"start found at scan {first + 1}, {seconds:.0f} s")
         session = end_to_end.with_fitted_truth(session, robust, first)
     paper = end_to_end.run_paper(session, odometry, raw, map_points, seed, report)
     rows = []
@@ -148,7 +147,6 @@ def main(arguments: list[str] | None = None) -> int:
             session = end_to_end.open_oxford(given.session, given.max_scans)
         else:
             session = end_to_end.open_images(root, max_scans=given.max_scans)
-        torch.manual_seed(given.seed)
         table = run_session(session, load_network(given.network), root, Path(given.out), given.seed, report)
     except ValueError as error:
         print(f"error: {error}", file=sys.stderr)
