@@ -221,7 +221,7 @@ def write_oxford(folder: Path, segment: Any, n: int) -> np.ndarray:
 @pytest.fixture(scope="module")
 def town(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path, np.ndarray]:
     """A map in the real one's form, and a simulated session on it: raw radar and official odometry only."""
-    root, n = tmp_path_factory.mktemp("real"), 44
+    root, n = tmp_path_factory.mktemp("real"), 38
     truth, image = drive_poses(n), np.zeros(rall.MAP_SHAPE, dtype=np.uint8)
     rows, columns = ((np.array(rall.MAP_CORNER) - build_walls(truth)) / rall.MAP_CELL).astype(int).T
     image[rows, columns] = 255
