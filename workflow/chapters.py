@@ -50,13 +50,8 @@ CHAPTERS = {
 LISTS, FOLDERS = ("sessions", "methods"), ("sessions_root", "out_dir", "book_dir")
 CONFIG_KEYS = {"profile", *LISTS, *FOLDERS, "seed", "notebooks", "simulated"}
 OPTIONAL_KEYS = {"real_root"}
-SHARED = (
-    "sessions_root",
-    "sessions",
-    "out_dir",
-    "seed",
-    "real_root",
-)  # keys that are parameters of notebooks
+# Keys that are parameters of notebooks.
+SHARED = ("sessions_root", "sessions", "out_dir", "seed", "real_root")
 
 
 class ChapterError(ValueError):
