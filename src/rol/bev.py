@@ -118,13 +118,13 @@ def crest_pixels(image: np.ndarray, sigma: float = 0.8) -> np.ndarray:
     Returns
     -------
     is_crest : array of bool, shape (h, w)
-        True where the smoothed image is not smaller than both neighbours in the direction, of four, in which it
-        is curved down most; one of two equal neighbours counts.
+        True where the smoothed image is not smaller than both neighbours in the direction, of four, in which
+        it is curved down most; one of two equal neighbours counts.
 
     Notes
     -----
-    Non-maximum suppression as in Canny's edge detector. A generator that is uncertain by a pixel draws lines three
-    pixels wide; the wall is in the middle. Not in the paper.
+    Non-maximum suppression as in Canny's edge detector. A generator that is uncertain by a pixel draws lines
+    three pixels wide; the wall is in the middle. Not in the paper.
     """
     smooth = cv2.GaussianBlur(np.asarray(image, dtype=np.float32), (0, 0), sigma)
     padded = np.pad(smooth, 1, mode="edge")

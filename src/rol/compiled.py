@@ -38,7 +38,8 @@ def compiled(function: Callable | None = None, **options: Any) -> Callable:
 
 
 class _TolerantCache(FunctionCache):
-    """numba's cache, except that unreadable files are replaced and files that cannot be written are skipped."""
+    """numba's cache, except that unreadable files are replaced and files that cannot be written are
+    skipped."""
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         with contextlib.suppress(Exception):  # damaged pickles raise almost any exception

@@ -1,8 +1,8 @@
 """Evaluation of a localization run: errors, classes, failures, and their files.
 
-The measures of the paper's Tables II and III (Sec. IV-C): root mean square errors of position and heading, the fractions of
-scans within three pairs of limits, and failures. The paper states no rule for failures; `FailureRule` is one with
-parameters. Trajectories are written in the TUM format, which ``evo`` reads.
+The measures of the paper's Tables II and III (Sec. IV-C): root mean square errors of position and heading,
+the fractions of scans within three pairs of limits, and failures. The paper states no rule for failures;
+`FailureRule` is one with parameters. Trajectories are written in the TUM format, which ``evo`` reads.
 """
 
 from __future__ import annotations
@@ -109,9 +109,9 @@ def fraction_within(errors: PoseErrors, max_position_m: float, max_yaw_deg: floa
 class FailureRule:
     """Rule of a failure: an error above a limit for a time without a break.
 
-    The paper counts failures without a definition. Beyond 20 m the walls of another street are closer than the correct
-    ones, and with a heading error of 45 deg no street matches, so a filter recovers only by chance. A shorter excursion may
-    be caused by a passing lorry, hence the five seconds.
+    The paper counts failures without a definition. Beyond 20 m the walls of another street are closer than
+    the correct ones, and with a heading error of 45 deg no street matches, so a filter recovers only by
+    chance. A shorter excursion may be caused by a passing lorry, hence the five seconds.
 
     Attributes
     ----------
@@ -258,8 +258,8 @@ def drift_by_length(
     estimate, truth : array, shape (n, 3)
         Poses in any two frames [m, m, rad].
     lengths_m : tuple of float
-        Lengths of the segments along the true path [m]; one starts at every tenth pose and ends at the first pose at this
-        distance. Lengths that exceed the path are left out.
+        Lengths of the segments along the true path [m]; one starts at every tenth pose and ends at the first
+        pose at this distance. Lengths that exceed the path are left out.
 
     Returns
     -------
@@ -420,7 +420,8 @@ def check_pair(estimate: np.ndarray, truth: np.ndarray) -> tuple[np.ndarray, np.
 
 
 def _segment_errors(estimate: np.ndarray, truth: np.ndarray, length_m: float) -> np.ndarray:
-    """Compute the errors at the end of segments of one length, shape (n, 2): position [%], heading [deg per 100 m]."""
+    """Compute the errors at the end of segments of one length, shape (n, 2): position [%],
+    heading [deg per 100 m]."""
     path_m = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(truth[:, :2], axis=0).T))])
     first = np.arange(0, len(path_m), 10)
     last = np.searchsorted(path_m, path_m[first] + length_m)

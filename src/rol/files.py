@@ -27,8 +27,8 @@ def write_bytes(path: Path | str, data: bytes) -> None:
     Raises
     ------
     OSError
-        If the file cannot be written. The message names it and says when the disk is full; no temporary file is
-        left.
+        If the file cannot be written. The message names it and says when the disk is full; no temporary file
+        is left.
     """
     path = Path(path)
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
@@ -84,8 +84,8 @@ def read_text(path: Path | str, error_type: type[ValueError] = ValueError) -> st
 class ImageFolder:
     """Images of one session that all depend on the same settings, as ``<microseconds>.png``.
 
-    ``settings.json`` is written first and tells which settings the images belong to, so that an interrupted run can
-    be resumed. The listing is written last; without it the folder is incomplete.
+    ``settings.json`` is written first and tells which settings the images belong to, so that an interrupted
+    run can be resumed. The listing is written last; without it the folder is incomplete.
 
     Attributes
     ----------
@@ -121,8 +121,8 @@ class ImageFolder:
         Raises
         ------
         ValueError
-            If the folder is not empty and its ``settings.json`` does not name this listing, or images with other
-            settings lie behind a symbolic link. The folder is left as it is.
+            If the folder is not empty and its ``settings.json`` does not name this listing, or images with
+            other settings lie behind a symbolic link. The folder is left as it is.
         """
         folder = Path(self.folder)
         marker, wanted = folder / "settings.json", {"listing": self.listing, "settings": settings}

@@ -1,8 +1,8 @@
 """Poses in the plane (SE(2)) and in space: compose, invert, exp, log, transform.
 
-A 2D pose is an array whose last axis holds ``(x, y, yaw)`` in metres and radians; x points forward, y left, and yaw
-turns counter-clockwise. A pose named ``T_a_b`` maps points of frame ``b`` into frame ``a``; it is at the same time the
-pose of ``b`` as seen from ``a``. A 3D transform is a 4 x 4 matrix with the same naming.
+A 2D pose is an array whose last axis holds ``(x, y, yaw)`` in metres and radians; x points forward, y left,
+and yaw turns counter-clockwise. A pose named ``T_a_b`` maps points of frame ``b`` into frame ``a``; it is at
+the same time the pose of ``b`` as seen from ``a``. A 3D transform is a 4 x 4 matrix with the same naming.
 """
 
 from __future__ import annotations
@@ -134,12 +134,12 @@ def check_fields(
     Parameters
     ----------
     settings : dataclass
-        Instance to check; fields declared as ``int`` must be whole numbers, those declared as ``bool`` True or False;
-        tuples are checked value by value. Fields declared as ``str``, as a mapping or as a settings class must be of that
-        class, or of another one that has all its public methods.
+        Instance to check; fields declared as ``int`` must be whole numbers, those declared as ``bool`` True
+        or False; tuples are checked value by value. Fields declared as ``str``, as a mapping or as a settings
+        class must be of that class, or of another one that has all its public methods.
     allowed : mapping
-        Range or choices -> names of the fields, separated by spaces. A range is written as an interval, such as
-        "(0, inf)", where a bracket includes the bound; choices are a tuple of words.
+        Range or choices -> names of the fields, separated by spaces. A range is written as an interval, such
+        as "(0, inf)", where a bracket includes the bound; choices are a tuple of words.
     error : type
         Exception to raise.
 
@@ -183,7 +183,8 @@ def _acts_as(value: Any, kind: type) -> bool:
 def check_number(name: str, value: Any, span: str, kind: Any, error: type[ValueError] = ValueError) -> None:
     """Check that a number, or each number of nested tuples, lies in an interval such as "[0, 1)".
 
-    The kind ``int`` asks for one whole number and ``float`` for one number; with any other kind, numbers may be nested.
+    The kind ``int`` asks for one whole number and ``float`` for one number; with any other kind, numbers may
+    be nested.
 
     Raises
     ------
@@ -236,8 +237,8 @@ def check_grid(
     Raises
     ------
     ValueError
-        Or the given ``error``, when the grid is larger than ``MAX_GRID_BYTES`` or the points reach over more than
-        ``MAX_EXTENT_M``; it says how far the points reach and how many of them lie far from the others.
+        Or the given ``error``, when the grid is larger than ``MAX_GRID_BYTES`` or the points reach over more
+        than ``MAX_EXTENT_M``; it says how far the points reach and how many of them lie far from the others.
     """
     size = n_bytes * float(np.prod(np.asarray(shape, dtype=np.float64)))
     low, high = points.min(axis=0), points.max(axis=0)

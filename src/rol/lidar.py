@@ -1,8 +1,8 @@
 """Transform lidar sweeps into the radar frame, remove the ground, and crop the range.
 
-Points are arrays whose first columns are x, y, z [m]; further columns (intensity, label) are kept. Heights are those
-in the radar frame, which is level and about 2 m above the road; the vehicle frame of the data set is pitched by
-0.05 rad against it, so a height threshold there would be inclined against the ground.
+Points are arrays whose first columns are x, y, z [m]; further columns (intensity, label) are kept. Heights
+are those in the radar frame, which is level and about 2 m above the road; the vehicle frame of the data set
+is pitched by 0.05 rad against it, so a height threshold there would be inclined against the ground.
 """
 
 from __future__ import annotations
@@ -74,7 +74,8 @@ def remove_ground(points: np.ndarray, min_height: float = -1.5, max_height: floa
 
     Notes
     -----
-    Yin et al. 2020, Sec. III-A: "a height threshold on original 3D lidar point cloud". The paper gives no number.
+    Yin et al. 2020, Sec. III-A: "a height threshold on original 3D lidar point cloud". The paper gives no
+    number.
     """
     points = _check_points(points)
     if min_height > max_height:
@@ -123,8 +124,8 @@ def ground_removal_tradeoff(
     Returns
     -------
     ground_removed, objects_removed : array, shape (k,)
-        Fractions, 0..1, of the ground points and of the other points below each threshold; nan if there are no
-        points of the kind.
+        Fractions, 0..1, of the ground points and of the other points below each threshold; nan if there are
+        no points of the kind.
     """
     heights, is_ground = np.asarray(heights, dtype=np.float64), np.asarray(is_ground, dtype=bool)
     if heights.shape != is_ground.shape:

@@ -1,8 +1,8 @@
 """Point maps: accumulate the clouds of a session, register one map to another.
 
-The paper's ground truth (Sec. IV-A): each session starts at the origin, its lidar clouds are accumulated along its own
-odometry, and its map is registered to the map of the first session. The registration, composed with the session's poses,
-transforms them into the first map's frame.
+The paper's ground truth (Sec. IV-A): each session starts at the origin, its lidar clouds are accumulated
+along its own odometry, and its map is registered to the map of the first session. The registration, composed
+with the session's poses, transforms them into the first map's frame.
 """
 
 from __future__ import annotations
@@ -108,7 +108,8 @@ def accumulate_map(
 def _add_points(cells: list[np.ndarray], points: np.ndarray, cell: float) -> None:
     """Add points to their cells (in place): keys in increasing order, sums of x and of y, numbers of points.
 
-    The arrays are replaced one by one, so that only one of them exists twice at a time; the last cell is an end mark.
+    The arrays are replaced one by one, so that only one of them exists twice at a time; the last cell is an
+    end mark.
     """
     indices = np.floor(points / cell).astype(np.int64)
     own = (indices[:, 0] << 32) + indices[:, 1]
@@ -137,7 +138,8 @@ class Registration:
     converged : bool
         Whether the last stage converged.
     stages : tuple of (float, float, float, array)
-        Per stage: radius around the start [m], largest distance of a pair [m], RMSE of the pairs [m], resulting pose.
+        Per stage: radius around the start [m], largest distance of a pair [m], RMSE of the pairs [m],
+        resulting pose.
     """
 
     T_target_source: np.ndarray
@@ -161,8 +163,8 @@ def register_maps(
 ) -> Registration:
     """Register one map to another by ICP, from near to far and from coarse to fine.
 
-    Sessions that start at one place agree best there. The first stage uses only the points around the start, so that a
-    heading error does not displace the far end of the map.
+    Sessions that start at one place agree best there. The first stage uses only the points around the start,
+    so that a heading error does not displace the far end of the map.
 
     Parameters
     ----------
@@ -171,7 +173,8 @@ def register_maps(
     init : array-like, shape (3,)
         Initial guess of T_target_source [m, m, rad]; zero for sessions with the same start.
     stages : tuple of (reach, max_distance, min_distance, cell)
-        Radius around the source's origin, the decreasing limit of pair distances, cell of the averaging of both [m].
+        Radius around the source's origin, the decreasing limit of pair distances, cell of the averaging of
+        both [m].
     max_iterations : int
         Largest number of iterations of each stage.
 

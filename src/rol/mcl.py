@@ -1,9 +1,10 @@
 """Monte Carlo localization on a prior lidar map: predict, weight, resample, estimate.
 
-The particle filter of the paper (Sec. III-B, Eq. 6-9) in functions that can be read, tested and copied one by one. A set
-of particles is an array (n, 3) of poses (x, y, yaw) in the map frame [m, m, rad] with an array (n,) of weights that sum to
-one. The map is stored as a grid: cell ``[i, j]`` spans ``origin + (i .. i + 1, j .. j + 1) * cell``, x along the first axis
-and y along the second. Points outside the grid are unmatched.
+The particle filter of the paper (Sec. III-B, Eq. 6-9) in functions that can be read, tested and copied one by
+one. A set of particles is an array (n, 3) of poses (x, y, yaw) in the map frame [m, m, rad] with an array
+(n,) of weights that sum to one. The map is stored as a grid: cell ``[i, j]`` spans ``origin +
+(i .. i + 1, j .. j + 1) * cell``, x along the first axis and y along the second. Points outside the grid are
+unmatched.
 """
 
 from __future__ import annotations
@@ -32,13 +33,13 @@ class MotionNoise:
     Attributes
     ----------
     forward_m, left_m, yaw_rad : float
-        Standard deviations of every increment [m, m, rad]. 0.5 m, 0.3 m and 1 deg: ICP between generated clouds is up to
-        0.8 m short in an increment while the vehicle accelerates, as it stays close to its initial guess. 0.2 m, 0.2 m and
-        0.5 deg lost the pose on two of the demo's four sessions as they were first simulated; these values were chosen
-        after that.
+        Standard deviations of every increment [m, m, rad]. 0.5 m, 0.3 m and 1 deg: ICP between generated
+        clouds is up to 0.8 m short in an increment while the vehicle accelerates, as it stays close to its
+        initial guess. 0.2 m, 0.2 m and 0.5 deg lost the pose on two of the demo's four sessions as they were
+        first simulated; these values were chosen after that.
     per_m, yaw_per_rad : float
-        Standard deviation added per metre driven and per radian turned. 0.03 is twice the 1.5 % by which the authors'
-        published odometry is short.
+        Standard deviation added per metre driven and per radian turned. 0.03 is twice the 1.5 % by which the
+        authors' published odometry is short.
 
     Raises
     ------
@@ -70,8 +71,8 @@ class Measurement:
     Attributes
     ----------
     exponent : float
-        lambda of Eq. 8. 20: one per cent more matched points increases a weight by a fifth. With 1 the counts of
-        neighbouring particles differ too little to correct the estimate.
+        lambda of Eq. 8. 20: one per cent more matched points increases a weight by a fifth. With 1 the counts
+        of neighbouring particles differ too little to correct the estimate.
     d_th_m : float
         Matching distance of Eq. 9 [m]. 0.5: two image pixels, about the width of a wall in the map.
     cell_m : float
@@ -102,7 +103,8 @@ class Resampling:
     Attributes
     ----------
     ess_fraction : float
-        Resample when the effective sample size falls below this fraction of the particles; 1 means after each scan.
+        Resample when the effective sample size falls below this fraction of the particles; 1 means after each
+        scan.
 
     Raises
     ------
@@ -127,8 +129,8 @@ class MclSettings:
     Attributes
     ----------
     n_particles : int
-        Particles at the start. 500: an update takes about ten milliseconds on one core; more particles change little once
-        the pose is tracked.
+        Particles at the start. 500: an update takes about ten milliseconds on one core; more particles change
+        little once the pose is tracked.
     start_spread_m, start_spread_yaw_rad : float
         Standard deviation of the first particles about the start pose [m, rad]: a start set by hand.
     motion : MotionNoise
@@ -163,8 +165,8 @@ class MapGrid:
     Attributes
     ----------
     values : array of uint8, shape (h, w)
-        1 where a point is matched (Eq. 9), else 0; or a score from 0 to ``best``. One byte per cell, so that the grid of a
-        city fits into the processor's cache. The score outside the grid is 0.
+        1 where a point is matched (Eq. 9), else 0; or a score from 0 to ``best``. One byte per cell, so that
+        the grid of a city fits into the processor's cache. The score outside the grid is 0.
     origin : array, shape (2,)
         Corner of cell [0, 0] with the smallest x and y [m].
     cell : float
@@ -256,9 +258,9 @@ def build_matched_grid(map_points: np.ndarray, d_th: float = 0.5, cell: float = 
 def _sum_values(particles, points, values, x0, y0, cell):
     """Sum the grid's values under the points at each particle.
 
-    Two loops per particle, both without branches. The first finds the points' cells, several at once in the processor's
-    vector registers; the second only reads them. A point outside the grid is read at the first cell, whose value is
-    subtracted from the sum again.
+    Two loops per particle, both without branches. The first finds the points' cells, several at once in the
+    processor's vector registers; the second only reads them. A point outside the grid is read at the first
+    cell, whose value is subtracted from the sum again.
     """
     # With 64 bits, each value would be converted on its own.
     h, w = np.int32(values.shape[0]), np.int32(values.shape[1])
@@ -292,8 +294,8 @@ def count_matches(particles: np.ndarray, points: np.ndarray, grid: MapGrid) -> n
     points : array, shape (m, 2)
         Points of the scan in the radar frame [m].
     grid : MapGrid
-        From `build_matched_grid`; scores of another grid are summed. ``values`` of bool or uint8; an array that is not
-        contiguous is copied first.
+        From `build_matched_grid`; scores of another grid are summed. ``values`` of bool or uint8; an array
+        that is not contiguous is copied first.
 
     Returns
     -------
@@ -387,8 +389,8 @@ def log_weights(counts: np.ndarray, exponent: float) -> np.ndarray:
     Returns
     -------
     log_weights : array, shape (n,)
-        lambda log N; minus infinity where nothing matched. Logarithms, as 1000^200 overflows. Yin et al. 2020,
-        Sec. III-B, Eq. 8.
+        lambda log N; minus infinity where nothing matched. Logarithms, as 1000^200 overflows. Yin et al.
+        2020, Sec. III-B, Eq. 8.
 
     Raises
     ------
@@ -416,8 +418,8 @@ def normalize_weights(log_weights: np.ndarray, prior: np.ndarray | None = None) 
     Returns
     -------
     weights : array, shape (n,)
-        Normalized weights (eta of Eq. 6). When the total is zero the prior is returned unchanged: a scan that matches
-        nowhere is no evidence about the pose.
+        Normalized weights (eta of Eq. 6). When the total is zero the prior is returned unchanged: a scan that
+        matches nowhere is no evidence about the pose.
     measurement_used : bool
         False when the total was zero.
 
@@ -487,8 +489,8 @@ def estimate_pose(particles: np.ndarray, weights: np.ndarray) -> tuple[np.ndarra
     Returns
     -------
     pose : array, shape (3,)
-        Weighted mean; the heading is that of the mean direction, or of the particle with the largest weight where the
-        mean direction is undefined.
+        Weighted mean; the heading is that of the mean direction, or of the particle with the largest weight
+        where the mean direction is undefined.
     spread_m : float
         Root of the weighted mean squared distance to the mean [m].
     spread_yaw : float
@@ -540,7 +542,8 @@ class MclUpdate:
 
     @property
     def covariance(self) -> np.ndarray:
-        """Covariance of (x, y, yaw), shape (3, 3) [m, m, rad]: that of the particles, plus 1 cm and 0.05 deg."""
+        """Covariance of (x, y, yaw), shape (3, 3) [m, m, rad]: that of the particles,
+        plus 1 cm and 0.05 deg."""
         away = self.particles - self.pose
         away[:, 2] = wrap_angle(away[:, 2])
         return (away * self.weights[:, None]).T @ away + np.diag([1e-4, 1e-4, np.deg2rad(0.05) ** 2])
@@ -655,8 +658,8 @@ def localize(
     clouds : iterable of array, shape (m, 2)
         Points of each scan in the radar frame [m].
     reset_callback : callable, optional
-        Called with the index of the scan and the estimate; the filter is reset to a pose that it returns, as the authors
-        did by hand.
+        Called with the index of the scan and the estimate; the filter is reset to a pose that it returns, as
+        the authors did by hand.
 
     Yields
     ------
@@ -681,7 +684,8 @@ def localize(
 
 
 def pick_indices(weights: np.ndarray, draws: np.ndarray) -> np.ndarray:
-    """Find draws in [0, 1] on the cumulative weights; a draw beyond their rounded end takes the last positive weight."""
+    """Find draws in [0, 1] on the cumulative weights;
+    a draw beyond their rounded end takes the last positive weight."""
     indices = np.searchsorted(np.cumsum(weights), draws, side="right")
     return np.minimum(indices, np.flatnonzero(weights)[-1])
 

@@ -1,8 +1,8 @@
 """Odometry by registration: 2D point-to-point ICP between the clouds of successive scans.
 
-The motion u of the filter (paper, Sec. III-B): the cloud of one scan is registered to the cloud of the scan before. A
-result ``T_target_source`` maps points of the source into the target's frame. With the earlier scan as the target it is
-the odometry increment: the pose of the later scan in the earlier one.
+The motion u of the filter (paper, Sec. III-B): the cloud of one scan is registered to the cloud of the scan
+before. A result ``T_target_source`` maps points of the source into the target's frame. With the earlier scan
+as the target it is the odometry increment: the pose of the later scan in the earlier one.
 """
 
 from __future__ import annotations
@@ -22,7 +22,8 @@ else:  # this file was copied and is imported by its own name
 
 
 class OdometryError(ValueError):
-    """Raised for clouds of a wrong shape or with values that are not finite, and for settings out of their range."""
+    """Raised for clouds of a wrong shape or with values that are not finite,
+    and for settings out of their range."""
 
 
 @dataclass(frozen=True)
@@ -32,8 +33,9 @@ class IcpSettings:
     Attributes
     ----------
     max_distance, min_distance : float
-        Pairs farther apart than a limit are discarded. The limit falls from the first value to the second by a fifth
-        per iteration: the first fits correct large offsets, the last ones exclude false neighbours [m].
+        Pairs farther apart than a limit are discarded. The limit falls from the first value to the second by
+        a fifth per iteration: the first fits correct large offsets, the last ones exclude false neighbours
+        [m].
     trim : float
         Fraction of the remaining pairs, the closest ones, that is kept.
     max_iterations : int
@@ -43,8 +45,8 @@ class IcpSettings:
     min_matched : int
         With fewer pairs the registration stops and ``converged`` is False.
     max_points : int
-        Of a larger source this many points are used, evenly spaced; the target is used whole. With clouds of 3,000
-        points the result is as good with 1,000, in a quarter of the time.
+        Of a larger source this many points are used, evenly spaced; the target is used whole. With clouds of
+        3,000 points the result is as good with 1,000, in a quarter of the time.
 
     Raises
     ------
@@ -124,8 +126,8 @@ def fit_rigid(source: np.ndarray, target: np.ndarray) -> np.ndarray:
     Returns
     -------
     T_target_source : array, shape (3,)
-        Minimizer of the sum of squared distances [m, m, rad]. In the plane the SVD solution of Arun et al. has this
-        closed form: the heading is the angle of (sum of dot products, sum of cross products).
+        Minimizer of the sum of squared distances [m, m, rad]. In the plane the SVD solution of Arun et al.
+        has this closed form: the heading is the angle of (sum of dot products, sum of cross products).
 
     Raises
     ------
@@ -222,9 +224,9 @@ def scan_to_scan_icp(
     Yields
     ------
     result : IcpResult
-        One fewer than clouds: the pose of each scan in the one before. Where the registration is impossible (an empty
-        cloud, for instance) the increment is the guess and ``n_matched`` is below ``min_matched``. Yin et al. 2020,
-        Sec. III-B.
+        One fewer than clouds: the pose of each scan in the one before. Where the registration is impossible
+        (an empty cloud, for instance) the increment is the guess and ``n_matched`` is below ``min_matched``.
+        Yin et al. 2020, Sec. III-B.
     """
     clouds = iter(clouds)
     guess = np.zeros(3) if first_guess is None else check_pose(first_guess, "first guess")
@@ -258,8 +260,9 @@ def choose_evenly(points: np.ndarray, n: int) -> np.ndarray:
     return points[np.linspace(0, len(points) - 1, min(len(points), n)).astype(int)]
 
 
-# Nearest neighbours are searched in cells of 1 m. The cells of a cloud are numbered as on a torus: cell (i, j) shares its
-# number with (i + width, j), (i, j + width) and so on. Distant points need no memory, and no point is missed.
+# Nearest neighbours are searched in cells of 1 m. The cells of a cloud are numbered as on a torus: cell
+# (i, j) shares its number with (i + width, j), (i, j + width) and so on. Distant points need no memory, and
+# no point is missed.
 
 
 @compiled
@@ -270,7 +273,8 @@ def cell_index(x):
 
 @compiled
 def _sort(points):
-    """Sort points by cell; return them and the index of the first point of each cell, shape (width^2 + 1,)."""
+    """Sort points by cell; return them and the index of the first point of each cell,
+    shape (width^2 + 1,)."""
     width = 8
     while width * width < 4 * len(points):
         width *= 2
@@ -301,9 +305,11 @@ def _count_around(target, enough):
 
 @compiled
 def _find_nearest(x, y, target, limit):
-    """Find the nearest point to (x, y); return its index and squared distance, (-1, limit) if none is below the limit.
+    """Find the nearest point to (x, y); return its index and squared distance,
+    (-1, limit) if none is below the limit.
 
-    Cells of the `SortedCloud` are searched in square rings, until the next ring is too far away or the torus is closed.
+    Cells of the `SortedCloud` are searched in square rings, until the next ring is too far away or the torus
+    is closed.
     """
     points, starts, around = target
     width = np.int64(np.sqrt(len(starts) - 1))
@@ -334,8 +340,8 @@ def _find_nearest(x, y, target, limit):
 def pair_points(pose, source, target, limit):
     """Transform points and pair each with its nearest target point.
 
-    Returns the transformed points that have a neighbour below the squared limit, shape (k, 2), its index in the target
-    and the squared distance, shape (k,).
+    Returns the transformed points that have a neighbour below the squared limit, shape (k, 2), its index in
+    the target and the squared distance, shape (k,).
     """
     moved, matched = np.empty_like(source), np.empty(len(source), np.int64)
     squares, c, s, n = np.empty(len(source)), np.cos(pose[2]), np.sin(pose[2]), 0
@@ -361,7 +367,8 @@ def _find_closest(squares, fraction):
 
 @compiled
 def _fit_rigid(source, target, rows, matched):
-    """Fit as `fit_rigid` does; row k of the source, of those in ``rows``, is paired with row ``matched[k]`` of the target.
+    """Fit as `fit_rigid` does; row k of the source, of those in ``rows``,
+    is paired with row ``matched[k]`` of the target.
 
     Returns the motion (x, y, yaw) as a tuple, and whether these source points are not all at one place.
     """

@@ -1,8 +1,8 @@
 """Read a session of the Oxford Radar RobotCar data set: radar, lidars, odometry, GPS and INS.
 
 Oxford's frames have y to the right and z down; the readers turn them into x forward, y left, z up, yaw
-counter-clockwise. Stamps are int64 microseconds. A file that is missing, truncated, rotated or inconsistent raises
-`OxfordError`; the message names the file and the fault. Nothing is repaired silently.
+counter-clockwise. Stamps are int64 microseconds. A file that is missing, truncated, rotated or inconsistent
+raises `OxfordError`; the message names the file and the fault. Nothing is repaired silently.
 
 Data set: Barnes et al. 2020, "The Oxford Radar RobotCar Dataset"; used in Yin et al. 2020, Sec. IV-A.
 """
@@ -349,7 +349,8 @@ def load_velodyne_binary(path: Path | str) -> np.ndarray:
 
 
 def check_increasing(path: Path | str, stamps: np.ndarray, first_line: int) -> None:
-    """Raise an OxfordError where stamps do not increase; `first_line` is the file's line of the first stamp."""
+    """Raise an OxfordError where stamps do not increase;
+    `first_line` is the file's line of the first stamp."""
     is_wrong = stamps[1:] <= stamps[:-1]
     if is_wrong.any():
         i = int(np.argmax(is_wrong))
@@ -394,7 +395,8 @@ def column_type(name: str) -> type:
 
 
 def check_table(path: Path | str, table: pd.DataFrame, columns: list[str]) -> None:
-    """Raise an OxfordError for other columns, no row, a value missing or not finite, or times out of order."""
+    """Raise an OxfordError for other columns, no row, a value missing or not finite,
+    or times out of order."""
     if list(table.columns) != columns or len(table) == 0:
         fault = f"no rows, or wrong columns (missing: {', '.join(c for c in columns if c not in table) or 'none'})"
         raise OxfordError(f"{path}: {fault}; expected {','.join(columns)}")
@@ -482,7 +484,8 @@ def load_ins(path: Path | str) -> pd.DataFrame:
 class RadarOdometry:
     """Radar odometry of the data set.
 
-    Increment i is `T_destination_source`: the pose of the later scan (source) in the earlier one (destination).
+    Increment i is `T_destination_source`: the pose of the later scan (source) in the earlier one
+    (destination).
 
     Attributes
     ----------
@@ -527,8 +530,8 @@ def check_odometry(path: Path | str, odometry: RadarOdometry) -> None:
 def load_radar_odometry(path: Path | str) -> RadarOdometry:
     """Read `gt/radar_odometry.csv`.
 
-    A session of n scans has n - 2 rows. They connect its scans 0 to n - 2 without a gap, so every scan but the
-    last has a pose (2019-01-10-11-46-21: 8867 stamps, 8865 rows, 8866 poses).
+    A session of n scans has n - 2 rows. They connect its scans 0 to n - 2 without a gap, so every scan but
+    the last has a pose (2019-01-10-11-46-21: 8867 stamps, 8865 rows, 8866 poses).
 
     Parameters
     ----------
@@ -637,7 +640,8 @@ class Session:
         return self.root / "radar" / f"{int(stamp_us)}.png"
 
     def sweep_path(self, sensor: str, stamp_us: int) -> Path:
-        """Return the path of a lidar's sweep, the raw .png or else the .bin; an OxfordError without either."""
+        """Return the path of a lidar's sweep, the raw .png or else the .bin;
+        an OxfordError without either."""
         if sensor not in LIDARS:
             raise OxfordError(f"{self.root}: no lidar is called {sensor!r}; there are {', '.join(LIDARS)}")
         if (self.left_stamps_us if sensor == "velodyne_left" else self.right_stamps_us) is None:
@@ -660,8 +664,8 @@ def open_session(path: Path | str) -> Session:
     Parameters
     ----------
     path : path
-        Folder that holds `radar/` and `radar.timestamps`; lidars may be missing. A simulated session (its name
-        begins with `sim-`) must hold the `session.json` that its maker writes last.
+        Folder that holds `radar/` and `radar.timestamps`; lidars may be missing. A simulated session
+        (its name begins with `sim-`) must hold the `session.json` that its maker writes last.
 
     Returns
     -------
@@ -736,7 +740,8 @@ def _find_sensor_faults(session: Session, sensor: str) -> list[str]:
     frames = {name for name in sizes if name.endswith(suffixes) and name[:-4].isdecimal() and len(name) < 23}
     on_disk = np.unique(np.array([int(name[:-4]) for name in frames], dtype=np.int64))
     intervals = np.diff(stamps)
-    # A session may hold only the sweeps that scans need, 0.1 and 0.15 s apart in turn; the radar skips no turn.
+    # A session may hold only the sweeps that scans need, 0.1 and 0.15 s apart in turn; the radar skips no
+    # turn.
     longest = (1.5 if sensor == "radar" else 3.5) * np.median(intervals) if len(intervals) else 0.0
     is_gap = intervals > longest
     gaps = [f"{t / 1e6:.3f} s after {s}" for t, s in zip(intervals[is_gap], stamps[:-1][is_gap], strict=True)]

@@ -1,9 +1,9 @@
 """Pair radar scans with lidar sweeps: association in time, aligned images, and folders of images.
 
-A pair is a radar image and a lidar image, both uint8 with the sensor in the middle: row 0 farthest forward, column 0
-farthest left, pixel centres. A folder of pairs holds ``radar/<us>.png`` and ``lidar/<us>.png``, named by the radar's
-stamp, ``settings.json`` from the start and ``pairs.json`` once all pairs are there. A folder of generated lidar images
-holds ``<us>.png`` and ``fake.json`` in the same way.
+A pair is a radar image and a lidar image, both uint8 with the sensor in the middle: row 0 farthest forward,
+column 0 farthest left, pixel centres. A folder of pairs holds ``radar/<us>.png`` and ``lidar/<us>.png``,
+named by the radar's stamp, ``settings.json`` from the start and ``pairs.json`` once all pairs are there. A
+folder of generated lidar images holds ``<us>.png`` and ``fake.json`` in the same way.
 """
 
 from __future__ import annotations
@@ -113,8 +113,8 @@ def estimate_twists(odometry: RadarOdometry) -> np.ndarray:
     Returns
     -------
     twists : array, shape (n + 1, 3)
-        Body velocity (vx, vy, yaw rate) at each scan [m/s, m/s, rad/s]: between two increments the mean, weighted so
-        that it holds at the scan itself; at the ends that of the one increment.
+        Body velocity (vx, vy, yaw rate) at each scan [m/s, m/s, rad/s]: between two increments the mean,
+        weighted so that it holds at the scan itself; at the ends that of the one increment.
 
     Raises
     ------
@@ -228,8 +228,8 @@ def align_scans(
     Raises
     ------
     ValueError
-        If no lidar or an unknown one is given, or no scan has its sweeps within `max_gap_us`; the message gives
-        the smallest gap of each lidar.
+        If no lidar or an unknown one is given, or no scan has its sweeps within `max_gap_us`; the message
+        gives the smallest gap of each lidar.
 
     Notes
     -----
@@ -301,8 +301,8 @@ class PairSettings:
     Attributes
     ----------
     motion : str
-        "none" takes scan and sweeps as they are, as the paper does; "corrected" brings both to mid-scan and corrects
-        the Doppler shift.
+        "none" takes scan and sweeps as they are, as the paper does; "corrected" brings both to mid-scan and
+        corrects the Doppler shift.
     range_resolution, range_offset : float
         Length of a bin and offset of all ranges of the radar [m].
     doppler_seconds : float
@@ -340,7 +340,8 @@ class PairSettings:
 
     @classmethod
     def from_dict(cls, values: dict[str, Any]) -> PairSettings:
-        """Take the settings among the entries of a dict, such as the header of weights; defaults for the others."""
+        """Take the settings among the entries of a dict, such as the header of weights;
+        defaults for the others."""
         return cls(**{field.name: values[field.name] for field in fields(cls) if field.name in values})
 
 
@@ -568,8 +569,8 @@ def describe_pairs(session: Session, alignment_path: str | Path, settings: PairS
     Returns
     -------
     description : dict
-        The settings, `FORMAT`, the session's name, and digests of the alignment and of ``session.json`` (where there
-        is one); JSON values only.
+        The settings, `FORMAT`, the session's name, and digests of the alignment and of ``session.json``
+        (where there is one); JSON values only.
     """
     files, digests = {"made": session.root / "session.json", "alignment": Path(alignment_path)}, {}
     for name, path in files.items():
@@ -637,8 +638,8 @@ def read_points(
     Parameters
     ----------
     folder : path
-        Complete folder of the generated images of one session. Its ``fake.json`` holds under ``points`` the arguments
-        of `rol.bev.image_to_points`.
+        Complete folder of the generated images of one session. Its ``fake.json`` holds under ``points`` the
+        arguments of `rol.bev.image_to_points`.
     stamps_us : sequence of int
         Radar stamps of the scans [us].
     twists : sequence of (vx, vy, yaw rate), optional

@@ -53,7 +53,8 @@ def scan_to_points(network: TrainedNetwork, scan: Any) -> np.ndarray:
     network : TrainedNetwork
         From `rol.pix2pix.load_network`; it states the geometry of its images and its threshold.
     scan : RadarScan
-        From `rol.oxford.load_radar`; any object with ``power``, shape (a, b) of uint8, and ``azimuths``, shape (a,) [rad].
+        From `rol.oxford.load_radar`; any object with ``power``, shape (a, b) of uint8, and ``azimuths``,
+        shape (a,) [rad].
 
     Returns
     -------
@@ -71,7 +72,8 @@ def scan_to_points(network: TrainedNetwork, scan: Any) -> np.ndarray:
 class RadarLocalizer:
     """Localize radar scans on a lidar map, one at a time.
 
-    As in the paper, motion during a scan is not compensated; `rol_beyond.pipeline.RobustLocalizer` compensates it.
+    As in the paper, motion during a scan is not compensated; `rol_beyond.pipeline.RobustLocalizer`
+    compensates it.
 
     Parameters
     ----------

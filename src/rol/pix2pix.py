@@ -5,10 +5,10 @@ is the farthest forward, column 0 the farthest left. The networks are those of t
 code with one input and one output channel (Yin et al. 2020, Sec. III-A, Eq. 2-5, and Sec. IV-A).
 `rol.training` holds the training loop.
 
-Batch norm uses the statistics of its input, in training and in inference, and keeps no running statistics. The
-public code does the same as its authors use it. With one image per batch, the network is then the same function
-in training and in inference, so `generate` processes one image at a time. There is no dropout: only the initial
-weights and the order of the pairs are random.
+Batch norm uses the statistics of its input, in training and in inference, and keeps no running statistics.
+The public code does the same as its authors use it. With one image per batch, the network is then the same
+function in training and in inference, so `generate` processes one image at a time. There is no dropout: only
+the initial weights and the order of the pairs are random.
 """
 
 from __future__ import annotations
@@ -563,8 +563,8 @@ def load_weights(path: str | Path) -> Generator:
     Raises
     ------
     Pix2PixError
-        If the file is missing, truncated, of an architecture that is not registered, does not hold the weights
-        of its header's network, or holds a value that is not finite; the message names the file.
+        If the file is missing, truncated, of an architecture that is not registered, does not hold the
+        weights of its header's network, or holds a value that is not finite; the message names the file.
     """
     return load_network(path).generator
 
@@ -608,8 +608,8 @@ def load_network(path: str | Path) -> TrainedNetwork:
     Raises
     ------
     Pix2PixError
-        As `load_weights`, or if ``points`` or ``pairs_settings`` of the header hold values of another type or out of
-        range.
+        As `load_weights`, or if ``points`` or ``pairs_settings`` of the header hold values of another type or
+        out of range.
     """
     tensors, about = load_tensors(Path(path))
     return TrainedNetwork(_restore_generator(path, tensors, about), *_read_settings(path, about), about)

@@ -1,9 +1,9 @@
 """Convert polar radar scans: to a Cartesian image, to peaks and points, with motion compensation.
 
-A scan is an array of power in steps of half a decibel, one row per azimuth, one column per range bin. Azimuths are
-counter-clockwise positive; the radar turns clockwise, so they decrease from row to row. In an image row 0 is farthest
-forward (x) and column 0 farthest left (y); coordinates are those of pixel centres: ``x = ((width - 1) / 2 - row) *
-pixel_size``, and y alike with the column.
+A scan is an array of power in steps of half a decibel, one row per azimuth, one column per range bin.
+Azimuths are counter-clockwise positive; the radar turns clockwise, so they decrease from row to row. In an
+image row 0 is farthest forward (x) and column 0 farthest left (y); coordinates are those of pixel centres:
+``x = ((width - 1) / 2 - row) * pixel_size``, and y alike with the column.
 """
 
 from __future__ import annotations
@@ -89,8 +89,9 @@ def polar_to_cartesian(
 ) -> np.ndarray:
     """Resample a polar scan into a Cartesian image around the radar.
 
-    Without motion this is the convention of the data set's SDK, bilinear in range and azimuth. With motion every pixel
-    is taken from where the turning beam saw that place, so the image shows the world in the radar frame at mid-scan.
+    Without motion this is the convention of the data set's SDK, bilinear in range and azimuth. With motion
+    every pixel is taken from where the turning beam saw that place, so the image shows the world in the radar
+    frame at mid-scan.
 
     Parameters
     ----------
@@ -426,8 +427,8 @@ def _check_azimuths(azimuths: np.ndarray) -> np.ndarray:
 def _row_table(azimuths: np.ndarray, step: float) -> np.ndarray | None:
     """Tabulate the row of unevenly spaced azimuths at the rows of evenly spaced ones; None if all are even.
 
-    Entry i belongs to row ``(i + 0.5) / TABLE_STEPS - 1`` of a scan with the same first azimuth and the mean step.
-    The nearest entry is off by at most half an entry, 1/128 of a row.
+    Entry i belongs to row ``(i + 0.5) / TABLE_STEPS - 1`` of a scan with the same first azimuth and the mean
+    step. The nearest entry is off by at most half an entry, 1/128 of a row.
     """
     n, n_turn = len(azimuths), 2.0 * np.pi / step
     own = np.concatenate([azimuths[-1:] + 2.0 * np.pi, azimuths, azimuths[:1] - 2.0 * np.pi])
@@ -447,8 +448,8 @@ def _beam_at_places(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Compute range and row at which the moving radar saw places given in the frame at mid-scan.
 
-    The row gives the time, the time the pose, and the pose the row. Three iterations converge, since the beam turns
-    much faster than places move across it.
+    The row gives the time, the time the pose, and the pose the row. Three iterations converge, since the beam
+    turns much faster than places move across it.
     """
     vx, vy, yaw_rate = (np.float32(v) for v in motion.twist)
     first_rows = rows

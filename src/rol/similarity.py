@@ -1,7 +1,7 @@
 """Nearest-neighbour distances between generated points and lidar points, in the plane [m] (Sec. IV-B).
 
-Rules for empty clouds: a cloud without points has no distances (n = 0) and its fractions are nan, so that it is left
-out of means; against an empty reference every distance is infinite, so that the fractions are 0.
+Rules for empty clouds: a cloud without points has no distances (n = 0) and its fractions are nan, so that it
+is left out of means; against an empty reference every distance is infinite, so that the fractions are 0.
 """
 
 from __future__ import annotations
@@ -105,8 +105,8 @@ def similarity_summary(generated: np.ndarray, lidar: np.ndarray) -> dict[str, fl
     -------
     summary : dict
         ``n_fake``, ``n_real``; for ``fake_to_real`` (precision) and ``real_to_fake`` (recall) the fractions
-        ``_within_1m`` and ``_within_2m`` (0..1) and ``_median_m``; nan where the first cloud is empty. "fake" are
-        the generated points, "real" the lidar points.
+        ``_within_1m`` and ``_within_2m`` (0..1) and ``_median_m``; nan where the first cloud is empty. "fake"
+        are the generated points, "real" the lidar points.
 
     Notes
     -----

@@ -1,7 +1,8 @@
 """Training loop around `rol.pix2pix.train_step`, with history and checkpoints.
 
-A checkpoint is the only state: the order of the pairs and the learning rate follow from the seed and the number of
-the step. A run that was stopped and resumed therefore ends with the same losses as an uninterrupted one.
+A checkpoint is the only state: the order of the pairs and the learning rate follow from the seed and the
+number of the step. A run that was stopped and resumed therefore ends with the same losses as an uninterrupted
+one.
 """
 
 from __future__ import annotations
@@ -53,8 +54,9 @@ class TrainHooks:
     pixel_loss : callable, optional
         Replaces Eq. 4, see `rol.pix2pix.train_step`.
     draw_batch : callable, optional
-        Draws augmented pairs; takes the pairs, the indices of a batch and a random generator that depends on the seed and the step
-        alone; returns the (radar, lidar) pairs, each array float32 (1, h, w) in [-1, 1].
+        Draws augmented pairs; takes the pairs, the indices of a batch and a random generator that depends on
+        the seed and the step alone; returns the (radar, lidar) pairs, each array float32 (1, h, w) in
+        [-1, 1].
     on_report : callable, optional
         Called with each new row of the history and the generator.
     settings : mapping
@@ -237,8 +239,8 @@ def train(
     Parameters
     ----------
     pairs, held_out : sequence of (radar, lidar), each array float32 (1, h, w) in [-1, 1]
-        Pairs to train on, and pairs for evaluation only. Where `pairs` has a method ``name(index)``, errors name
-        the files of a batch by it.
+        Pairs to train on, and pairs for evaluation only. Where `pairs` has a method ``name(index)``, errors
+        name the files of a batch by it.
     config : TrainConfig
         The settings.
     out_dir : path
@@ -260,8 +262,8 @@ def train(
     Raises
     ------
     TrainingError
-        If there are no pairs, the checkpoint belongs to another run, or a loss or a gradient is not finite; then
-        the message names the step, the batch's files and the checkpoint.
+        If there are no pairs, the checkpoint belongs to another run, or a loss or a gradient is not finite;
+        then the message names the step, the batch's files and the checkpoint.
 
     Notes
     -----
@@ -349,7 +351,8 @@ def _prefetch(load: Callable[[int], Any], steps: range, workers: int) -> Iterato
 def _start(
     pairs: Any, config: pix2pix.TrainConfig, seed: int, device: str, hooks: TrainHooks
 ) -> tuple[TrainingState, dict[str, Any]]:
-    """Build the networks of a run and describe it; refuse an empty data set and intervals that do not match."""
+    """Build the networks of a run and describe it;
+    refuse an empty data set and intervals that do not match."""
     if len(pairs) == 0:
         raise TrainingError("no pairs to train on")
     rows, saved = config.report_every, config.checkpoint_every

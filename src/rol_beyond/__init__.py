@@ -1,1 +1,2 @@
-"""What goes beyond the paper and is compared with it: detectors, U-Net, adaptation, motion model, global search, recovery."""
+"""What goes beyond the paper and is compared with it: detectors, U-Net, adaptation, motion model,
+global search, recovery."""

@@ -1,8 +1,8 @@
 """Domain adaptation: fine-tune a network on a few pairs of a real radar scan and a lidar sweep.
 
-A network trained on simulated scans alone misjudges the artefacts of a real radar. A few real pairs correct this, even
-from another radar and a lidar of short reach: beyond the lidar's reach the target is the network's own previous output, so
-that it forgets nothing there.
+A network trained on simulated scans alone misjudges the artefacts of a real radar. A few real pairs correct
+this, even from another radar and a lidar of short reach: beyond the lidar's reach the target is the network's
+own previous output, so that it forgets nothing there.
 """
 
 from __future__ import annotations
@@ -109,7 +109,8 @@ def adapt(
     config : AdaptationConfig
         The settings.
     settings : PairSettings, optional
-        Settings of the images, such as ``range_resolution`` of the pairs' radar [m]; the defaults if not given.
+        Settings of the images, such as ``range_resolution`` of the pairs' radar [m]; the defaults if not
+        given.
 
     Returns
     -------

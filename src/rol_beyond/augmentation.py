@@ -1,7 +1,8 @@
 """Data augmentation: training pairs made on demand from polar scans and lidar points, with random changes.
 
-The rotation is applied before the scan is resampled and before the lidar points are rasterized. A rotated pair is
-therefore as good as the recorded one: no pixel is interpolated twice, no corner is lost. Images as in `rol.bev`.
+The rotation is applied before the scan is resampled and before the lidar points are rasterized. A rotated
+pair is therefore as good as the recorded one: no pixel is interpolated twice, no corner is lost. Images as in
+`rol.bev`.
 """
 
 from __future__ import annotations
@@ -137,7 +138,8 @@ def apply_gain(power: np.ndarray, gain_db: float) -> np.ndarray:
 
 
 def add_streaks(power: np.ndarray, n: int, rng: np.random.Generator) -> np.ndarray:
-    """Add streaks to a scan: a few neighbouring rows that are bright at all ranges, as after a very strong reflector.
+    """Add streaks to a scan: a few neighbouring rows that are bright at all ranges,
+    as after a very strong reflector.
 
     Parameters
     ----------
@@ -155,9 +157,9 @@ def add_streaks(power: np.ndarray, n: int, rng: np.random.Generator) -> np.ndarr
 
     Notes
     -----
-    The distributions were chosen from the eleven real scans: one to five rows, a level of 15 to 43 dB that falls by
-    1.5 to 5 dB per 13 m, speckle like that of other echoes, and in half of them echoes that repeat every few metres.
-    Stronger real echoes remain, so the lidar image is unchanged.
+    The distributions were chosen from the eleven real scans: one to five rows, a level of 15 to 43 dB that
+    falls by 1.5 to 5 dB per 13 m, speckle like that of other echoes, and in half of them echoes that repeat
+    every few metres. Stronger real echoes remain, so the lidar image is unchanged.
     """
     power, (n_rows, n_bins) = power.copy(), power.shape
     bins = np.arange(n_bins, dtype=np.float32)
@@ -338,7 +340,8 @@ class JoinedPairs:
         return part[place]
 
     def draw(self, index: int, *changes: Any) -> tuple[np.ndarray, np.ndarray]:
-        """Return a pair with the changes of `ScanPairs.draw`: turn, gain, streaks, ghosts and their generator."""
+        """Return a pair with the changes of `ScanPairs.draw`: turn, gain, streaks,
+        ghosts and their generator."""
         part, place = self._find(index)
         return part.draw(place, *changes)
 

@@ -1,4 +1,5 @@
-"""Metrics beyond those of the paper: median, longitudinal and lateral errors, and consistency of covariances (NEES)."""
+"""Metrics beyond those of the paper: median, longitudinal and lateral errors,
+and consistency of covariances (NEES)."""
 
 from __future__ import annotations
 
@@ -45,7 +46,8 @@ def pose_nees(estimate: np.ndarray, truth: np.ndarray, covariances: np.ndarray) 
     Returns
     -------
     nees : array, shape (n,)
-        e' C^-1 e with e = estimate - truth, its heading in [-pi, pi). The mean is 3 for consistent covariances.
+        e' C^-1 e with e = estimate - truth, its heading in [-pi, pi). The mean is 3 for consistent
+        covariances.
 
     Raises
     ------
@@ -70,8 +72,8 @@ def consistency(estimate: np.ndarray, truth: np.ndarray, covariances: np.ndarray
     Returns
     -------
     figures : dict
-        ``mean_nees``, 3 for a consistent filter and larger for an overconfident one, and ``within_95``, the fraction of
-        poses with a NEES below ``NEES_95`` (0..1).
+        ``mean_nees``, 3 for a consistent filter and larger for an overconfident one, and ``within_95``, the
+        fraction of poses with a NEES below ``NEES_95`` (0..1).
 
     Raises
     ------

@@ -1,7 +1,8 @@
-"""Front ends: from a polar radar scan to points by a network or by a peak detector, and their evaluation on a map.
+"""Front ends: from a polar radar scan to points by a network or by a peak detector,
+and their evaluation on a map.
 
-All points are in the radar frame, x forward, y left [m], at mid-scan if a twist is given. Detectors and networks get the
-same scan and the same motion, so that their points can be compared.
+All points are in the radar frame, x forward, y left [m], at mid-scan if a twist is given. Detectors and
+networks get the same scan and the same motion, so that their points can be compared.
 """
 
 from __future__ import annotations
@@ -98,8 +99,8 @@ def detect_points(
     twist : sequence of float, optional
         As in `generate_points`.
     detector : str
-        "k-strongest": the 12 strongest peaks of every azimuth with a power of 70 or more; "cfar": peaks above the mean
-        power of their surroundings in range.
+        "k-strongest": the 12 strongest peaks of every azimuth with a power of 70 or more; "cfar": peaks above
+        the mean power of their surroundings in range.
     range_limits_m : tuple of float
         Smallest and largest range of a point [m].
     calibration : RangeCalibration
@@ -170,13 +171,13 @@ def evaluate_on_map(points: np.ndarray, T_map_radar: np.ndarray, map_tree: cKDTr
     Returns
     -------
     precision : dict
-        ``n`` points, ``share_1m`` and ``share_2m``: the fractions within 1 m and 2 m of a map point (0..1, nan
-        without points).
+        ``n`` points, ``share_1m`` and ``share_2m``: the fractions within 1 m and 2 m of a map point
+        (0..1, nan without points).
 
     Notes
     -----
-    The paper's measure (Sec. IV-B) with the map instead of the lidar scan. Moving objects, and changes since the map
-    was made, count as wrong.
+    The paper's measure (Sec. IV-B) with the map instead of the lidar scan. Moving objects, and changes since
+    the map was made, count as wrong.
     """
     distances = map_tree.query(transform_points(T_map_radar, points))[0] if len(points) else np.zeros(0)
     fractions = {f"share_{r}m": fraction_within(distances, float(r)) for r in (1, 2)}

@@ -27,7 +27,8 @@ def generate_session(
     pairs : path
         Folder of the pairs of the session.
     folder : path
-        Folder of the generated images of the session. Images of another network or of other pairs are removed.
+        Folder of the generated images of the session. Images of another network or of other pairs are
+        removed.
     threshold : int
         Smallest grey value that counts as a point, 1 to 255; 0 for the one that comes with the weights.
     device : str

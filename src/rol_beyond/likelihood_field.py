@@ -22,12 +22,12 @@ class LikelihoodField:
     exponent : float
         lambda of Eq. 8, as in `rol.mcl.Measurement`. 20 was chosen with sampled points on the real route.
     sigma_m : float
-        Standard deviation of the Gaussian [m]. 0.2: on the real route 0.3 has a tenth more error, and with 0.45 the pose
-        is lost in dense map regions.
+        Standard deviation of the Gaussian [m]. 0.2: on the real route 0.3 has a tenth more error, and with
+        0.45 the pose is lost in dense map regions.
     density_radius_m : float
-        Points in dense map regions are down-weighted by the map within this distance, see `build_likelihood_field` [m]; 0
-        weights all alike. With 2 the pose slips far less along a street of hedges on the real route, where points match
-        at many places.
+        Points in dense map regions are down-weighted by the map within this distance, see
+        `build_likelihood_field` [m]; 0 weights all alike. With 2 the pose slips far less along a street of
+        hedges on the real route, where points match at many places.
     cell_m : float
         Side of a grid cell [m].
 
@@ -70,8 +70,9 @@ def build_likelihood_field(
     Returns
     -------
     grid : MapGrid
-        exp(-d^2 / 2 sigma^2) in 255 steps, 0 from three sigma on. With ``density_radius_m`` it is divided by 1 + c / 0.6,
-        with its mean c over the square: in a hedge nearly every place is matched, and a match there is little evidence.
+        exp(-d^2 / 2 sigma^2) in 255 steps, 0 from three sigma on. With ``density_radius_m`` it is divided by
+        1 + c / 0.6, with its mean c over the square: in a hedge nearly every place is matched, and a match
+        there is little evidence.
     """
     squares = (np.arange(4096) + 0.5) / 4096 * 9.0
     scores = np.round(255.0 * np.exp(-0.5 * squares)).astype(np.uint8)

@@ -1,8 +1,8 @@
 """Local-map odometry: register each scan to a map of the last metres, with motion compensation.
 
-Beyond the paper, which registers each scan to the one before (`rol.odometry.scan_to_scan_icp`). The points of a scan are
-compensated for the vehicle's motion during the turn of the radar and for the Doppler effect, with the velocity that the
-registration itself yields.
+Beyond the paper, which registers each scan to the one before (`rol.odometry.scan_to_scan_icp`). The points of
+a scan are compensated for the vehicle's motion during the turn of the radar and for the Doppler effect, with
+the velocity that the registration itself yields.
 """
 
 from __future__ import annotations
@@ -47,20 +47,21 @@ class MapSettings:
     Attributes
     ----------
     length_m : float
-        Keyframes farther from the vehicle than this are removed [m]. 20: 10 to 80 m drift alike, and a short map is fast.
+        Keyframes farther from the vehicle than this are removed [m]. 20: 10 to 80 m drift alike, and a short
+        map is fast.
     keyframe_m, keyframe_rad : float
         A keyframe is added after this distance or rotation since the last one [m, rad].
     cell_m : float
         The map has one point, the mean, per cell of this side [m]. 0.5: two pixels of an image.
     min_views : int
-        Cells seen by fewer keyframes are left out once there are three keyframes: false points rarely fall twice onto one
-        place. With half of all points false, 1 drifts four times as much as 2.
+        Cells seen by fewer keyframes are left out once there are three keyframes: false points rarely fall
+        twice onto one place. With half of all points false, 1 drifts four times as much as 2.
     line_radius_m, line_ratio : float
-        A map point lies on a line when the variance of its neighbours within the radius [m] across their main direction
-        is less than this fraction of the variance along it.
+        A map point lies on a line when the variance of its neighbours within the radius [m] across their main
+        direction is less than this fraction of the variance along it.
     along_weight : float
-        Weight of a squared distance along such a line, relative to one across it. 0.05: with 1, point to point, the
-        longitudinal errors are a quarter larger.
+        Weight of a squared distance along such a line, relative to one across it. 0.05: with 1, point to
+        point, the longitudinal errors are a quarter larger.
 
     Raises
     ------
@@ -93,8 +94,8 @@ class RobustIcpSettings:
     Attributes
     ----------
     start_scale_m, end_scale_m : float
-        Distance at which a pair has a quarter of the full weight; it falls from the first value to the second by a fifth
-        per fit [m].
+        Distance at which a pair has a quarter of the full weight; it falls from the first value to the second
+        by a fifth per fit [m].
     max_iterations : int
         Largest number of fits.
     tolerance : float
@@ -104,8 +105,8 @@ class RobustIcpSettings:
     max_points : int
         Of a larger source this many points are used, evenly spaced.
     rounds : int
-        Registrations per scan, each with the points compensated for the velocity that the one before found. 2: with 1
-        the drift is twice as large, and a third changes nothing.
+        Registrations per scan, each with the points compensated for the velocity that the one before found.
+        2: with 1 the drift is twice as large, and a third changes nothing.
 
     Raises
     ------
@@ -137,8 +138,8 @@ class PlausibilitySettings:
     Attributes
     ----------
     min_inlier_ratio : float
-        Smallest fraction of a scan's points within ``end_scale_m`` of the local map. 0.2: it is 0.05 for scans of false
-        points only, and above 0.35 with half of them false.
+        Smallest fraction of a scan's points within ``end_scale_m`` of the local map. 0.2: it is 0.05 for
+        scans of false points only, and above 0.35 with half of them false.
     max_acceleration : float
         Largest change of velocity, in any direction [m/s2]. 10: full braking.
     max_yaw_rate : float
@@ -223,7 +224,8 @@ class LocalMapIncrement:
     inlier_ratio : float
         Fraction of the scan's points near the local map at the pose tried last; 0 where none could be tried.
     fault : str
-        Empty for an accepted motion; otherwise why it was rejected, and the increment is that of constant velocity.
+        Empty for an accepted motion; otherwise why it was rejected, and the increment is that of constant
+        velocity.
     """
 
     T_target_source: np.ndarray
@@ -305,8 +307,8 @@ def register_robust(
     Returns
     -------
     result : IcpResult
-        ``T_target_source`` in the frame of the map; ``n_matched`` and ``rmse_m`` of the pairs within ``end_scale_m``;
-        ``converged`` False, and the pose of the last fit, where too few points match.
+        ``T_target_source`` in the frame of the map; ``n_matched`` and ``rmse_m`` of the pairs within
+        ``end_scale_m``; ``converged`` False, and the pose of the last fit, where too few points match.
 
     Raises
     ------
@@ -348,9 +350,9 @@ def local_map_odometry(
 ) -> Iterator[LocalMapIncrement]:
     """Estimate odometry by registering each cloud to a local map.
 
-    Each motion is predicted from the one before. An implausible one, or one with too few matches, is repeated from an
-    initial guess of `correlative_scan_match`. If that fails too, the increment is that of constant velocity and its
-    ``fault`` is set.
+    Each motion is predicted from the one before. An implausible one, or one with too few matches, is repeated
+    from an initial guess of `correlative_scan_match`. If that fails too, the increment is that of constant
+    velocity and its ``fault`` is set.
 
     Parameters
     ----------
@@ -361,21 +363,22 @@ def local_map_odometry(
     settings : LocalMapSettings
         Map, registration and plausibility.
     deskew : callable, optional
-        Takes a cloud and a twist and returns the cloud at mid-scan: `deskew_cloud` for points as read off scans, None
-        for points that are compensated already.
+        Takes a cloud and a twist and returns the cloud at mid-scan: `deskew_cloud` for points as read off
+        scans, None for points that are compensated already.
     first_twist : array, shape (3,), optional
         Body velocity at the first scan [m/s, m/s, rad/s]; searched for, up to about 24 m/s, if not given.
 
     Yields
     ------
     increment : LocalMapIncrement
-        One fewer than clouds: the pose of each scan in the one before; `rol.odometry.stack_increments` stacks them.
+        One fewer than clouds: the pose of each scan in the one before; `rol.odometry.stack_increments` stacks
+        them.
 
     Raises
     ------
     OdometryError
-        If times do not increase or do not match the number of clouds, or if a cloud has another shape or a value that is
-        not finite.
+        If times do not increase or do not match the number of clouds, or if a cloud has another shape or a
+        value that is not finite.
     """
     stamps_us = _check_stamps(stamps_us)
     odometry, n_clouds = LocalMapOdometry(settings, deskew=deskew, first_twist=first_twist), 0
@@ -507,7 +510,8 @@ class LocalMapOdometry:
         self._add_keyframe(cloud)
 
     def _map_at(self, twist: np.ndarray) -> LocalMap | None:
-        """Give the local map; while it is one cloud of uncertain velocity, deskew that cloud with this one."""
+        """Give the local map; while it is one cloud of uncertain velocity,
+        deskew that cloud with this one."""
         if self.anchor is None:
             return self.local_map
         return build_local_map([self._place(*self.anchor, twist)], self.settings.map)
@@ -560,7 +564,8 @@ def _check_stamps(stamps_us: np.ndarray) -> np.ndarray:
 
 @compiled
 def information_matrices(cloud, radius, ratio, along_weight):
-    """Compute the information matrix of each map point from the shape of its surroundings, shape (n, 2, 2)."""
+    """Compute the information matrix of each map point from the shape of its surroundings,
+    shape (n, 2, 2)."""
     matrices = np.empty((len(cloud.points), 2, 2))
     for k in range(len(matrices)):
         n, xx, yy, xy = _spread_about(cloud, cloud.points[k], radius, 12)
@@ -575,7 +580,8 @@ def information_matrices(cloud, radius, ratio, along_weight):
 
 @compiled
 def _spread_about(target, centre, radius, most):
-    """Compute number, variances and covariance (n, xx, yy, xy) of the ``most`` nearest points within a radius."""
+    """Compute number, variances and covariance (n, xx, yy, xy) of the ``most`` nearest points within a
+    radius."""
     near, n, x, y, xx, yy, xy = _find_near(target, centre, radius), 0, 0.0, 0.0, 0.0, 0.0, 0.0
     bound = np.partition(near[:, 2], most - 1)[most - 1] if len(near) > most else np.inf
     for k in range(len(near)):
@@ -609,8 +615,8 @@ def _find_near(target, centre, radius):
 def _normal_equations(pose, source, target, information, scales):
     """Sum the weighted normal equations over all pairs within three times the first scale.
 
-    Returns the Hessian for (x, y, yaw about the source's origin) next to the gradient, shape (3, 4); the number of pairs;
-    the number of pairs closer than the second scale, and the sum of their errors.
+    Returns the Hessian for (x, y, yaw about the source's origin) next to the gradient, shape (3, 4); the
+    number of pairs; the number of pairs closer than the second scale, and the sum of their errors.
     """
     moved, matched, _ = pair_points(pose, source, target, (3.0 * scales[0]) ** 2)
     sums, n_near, near_error = np.zeros((3, 4)), 0, 0.0

@@ -1,8 +1,9 @@
 """Motion model of radar odometry: scale, noise and outliers, calibrated on a session with known ground truth.
 
-The errors of radar odometry are partly systematic. It is short where the range resolution is assumed too small, a turn
-moves the sensor sideways when it is mounted ahead of the axle, errors of successive increments are correlated, and a few
-increments are plainly wrong. Increments are poses (x, y, yaw) of a scan in the one before [m, m, rad].
+The errors of radar odometry are partly systematic. It is short where the range resolution is assumed too
+small, a turn moves the sensor sideways when it is mounted ahead of the axle, errors of successive increments
+are correlated, and a few increments are plainly wrong. Increments are poses (x, y, yaw) of a scan in the one
+before [m, m, rad].
 """
 
 from __future__ import annotations
@@ -19,7 +20,8 @@ MIN_SIGMAS = (0.02, 0.01, np.deg2rad(0.1))  # of a stationary vehicle, which may
 
 @dataclass(frozen=True)
 class MotionModel:
-    """Distribution of the true increment given a measured one; the defaults take the odometry as it is, with wide noise.
+    """Distribution of the true increment given a measured one; the defaults take the odometry as it is,
+    with wide noise.
 
     A `rol.mcl.MclSettings.motion`. Yin et al. 2020, Sec. III-B, Eq. 7, with calibrated noise.
 
@@ -35,8 +37,8 @@ class MotionModel:
     outlier_fraction, outlier_scale : float
         Fraction of increments whose standard deviation is larger by this factor.
     stationary_m : float
-        Length below which the vehicle counts as stationary [m]. 0.08: of the real odometry's increments of a stationary
-        vehicle, 99 % are shorter.
+        Length below which the vehicle counts as stationary [m]. 0.08: of the real odometry's increments of a
+        stationary vehicle, 99 % are shorter.
 
     Raises
     ------
@@ -111,10 +113,10 @@ def calibrate_motion(
 ) -> MotionModel:
     """Calibrate the motion model on increments with known ground truth.
 
-    The matrix is fitted to sums over windows of increments, so that it holds over a distance and not for one increment
-    only. The noise is the standard deviation of such sums per increment, so that correlated errors enter with their sum.
-    Windows with an outlier are excluded; fraction and size of the outliers are too rare to be estimated from one session
-    and keep the defaults of `MotionModel`.
+    The matrix is fitted to sums over windows of increments, so that it holds over a distance and not for one
+    increment only. The noise is the standard deviation of such sums per increment, so that correlated errors
+    enter with their sum. Windows with an outlier are excluded; fraction and size of the outliers are too rare
+    to be estimated from one session and keep the defaults of `MotionModel`.
 
     Parameters
     ----------
@@ -123,8 +125,8 @@ def calibrate_motion(
     window : int
         Increments per window; over 16 increments, four seconds, errors are independent.
     inflation : float
-        Factor on the standard deviations: the odometry of another day has other errors, and errors are larger where the
-        vehicle brakes. With 2 the spread on the real route is wider than the error.
+        Factor on the standard deviations: the odometry of another day has other errors, and errors are larger
+        where the vehicle brakes. With 2 the spread on the real route is wider than the error.
 
     Returns
     -------
@@ -161,7 +163,8 @@ def calibrate_motion(
 
 
 def _fit_stationary(increments: np.ndarray, truth: np.ndarray) -> np.ndarray:
-    """Fit a diagonal matrix to increments of a stationary vehicle; the identity where there are fewer than 20."""
+    """Fit a diagonal matrix to increments of a stationary vehicle;
+    the identity where there are fewer than 20."""
     if len(increments) < 20:
         return np.eye(3)
     return np.diag(np.sum(increments * truth, axis=0) / np.maximum(np.sum(increments**2, axis=0), 1e-12))
@@ -174,7 +177,8 @@ def _find_outliers(increments: np.ndarray, truth: np.ndarray) -> np.ndarray:
 
 
 def _fit_noise(errors: np.ndarray, length: np.ndarray, stationary: np.ndarray) -> list[tuple[float, ...]]:
-    """Fit the three standard deviations of the model; `stationary` is the stationary fraction of each window."""
+    """Fit the three standard deviations of the model;
+    `stationary` is the stationary fraction of each window."""
 
     def spread(chosen: np.ndarray, otherwise: np.ndarray) -> np.ndarray:
         return np.sqrt(np.mean(errors[chosen] ** 2, axis=0)) if chosen.sum() > 4 else otherwise
@@ -210,10 +214,12 @@ def gate_odometry(
     increments : iterable of array, shape (3,)
         Odometry at a constant rate [m, m, rad].
     max_change : tuple of float
-        Largest change from one increment to the next, forward [m] and in heading [rad]. At 4 Hz 0.6 m correspond to an
-        acceleration of 10 m/s2, full braking, and 2.5 deg are more than twice the change at the entry of a bend.
+        Largest change from one increment to the next, forward [m] and in heading [rad]. At 4 Hz 0.6 m
+        correspond to an acceleration of 10 m/s2, full braking, and 2.5 deg are more than twice the change at
+        the entry of a bend.
     patience : int
-        After this number of rejected increments in a row the next one is accepted: then the reference was wrong.
+        After this number of rejected increments in a row the next one is accepted: then the reference was
+        wrong.
 
     Yields
     ------

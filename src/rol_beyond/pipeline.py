@@ -16,17 +16,20 @@ FrontEnd = Callable[[Any, tuple[float, float, float] | None], np.ndarray]
 
 
 class RobustLocalizer:
-    """Localize radar scans on a lidar map, one at a time, with recovery; has the ``step`` of `rol.pipeline.RadarLocalizer`.
+    """Localize radar scans on a lidar map, one at a time, with recovery;
+    has the ``step`` of `rol.pipeline.RadarLocalizer`.
 
     Parameters
     ----------
     robust_filter : RecoveringFilter
         Map, start and settings.
     front_end : callable
-        Takes a scan and a twist (vx, vy, yaw rate) or None and returns points in the radar frame, shape (n, 2) [m],
-        compensated for the twist; for instance a `rol_beyond.front_ends.generate_points` with its network.
+        Takes a scan and a twist (vx, vy, yaw rate) or None and returns points in the radar frame, shape
+        (n, 2) [m], compensated for the twist; for instance a `rol_beyond.front_ends.generate_points` with its
+        network.
     density_radius_m : float
-        Radius of `rol_beyond.front_ends.resample_by_density` for the points given to the filter [m]; 0 leaves them as they are.
+        Radius of `rol_beyond.front_ends.resample_by_density` for the points given to the filter [m]; 0 leaves
+        them as they are.
     odometry : LocalMapOdometry, optional
         With other settings than the default.
     """
@@ -45,8 +48,8 @@ class RobustLocalizer:
     def step(self, scan: Any) -> LocalizedScan:
         """Localize one scan.
 
-        The points of the scan as recorded give the increment and the velocity; with this velocity the front end makes the
-        compensated points that the filter uses. The first scan is not compensated.
+        The points of the scan as recorded give the increment and the velocity; with this velocity the front
+        end makes the compensated points that the filter uses. The first scan is not compensated.
 
         Parameters
         ----------

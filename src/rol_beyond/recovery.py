@@ -1,19 +1,22 @@
-"""Localization that detects when it is lost, reports it, and relocalizes without ground truth or manual resets.
+"""Localization that detects when it is lost, reports it,
+and relocalizes without ground truth or manual resets.
 
-Two tests are made with every scan. First, does the scan match better at the estimate than by chance? The score contrast
-(`rol_beyond.search.score_contrast`), averaged over two seconds, is normalized by its value at correct poses. Second, does
-it match better elsewhere? When the normalized score is low, poses around the estimate are searched with the scans of the
-last seconds. Each good one becomes a hypothesis, a small particle filter of its own. A hypothesis that matches better than
-the estimate over several scans, none of which was used to find it, replaces the estimate.
+Two tests are made with every scan. First, does the scan match better at the estimate than by chance? The
+score contrast (`rol_beyond.search.score_contrast`), averaged over two seconds, is normalized by its value at
+correct poses. Second, does it match better elsewhere? When the normalized score is low, poses around the
+estimate are searched with the scans of the last seconds. Each good one becomes a hypothesis, a small particle
+filter of its own. A hypothesis that matches better than the estimate over several scans, none of which was
+used to find it, replaces the estimate.
 
-A wrong place may match for seconds, as streets repeat themselves, so no decision is based on one scan. A stationary vehicle
-observes the same false points again and again. So once an estimate is trusted, only scans taken while moving count against
-it.
+A wrong place may match for seconds, as streets repeat themselves, so no decision is based on one scan. A
+stationary vehicle observes the same false points again and again. So once an estimate is trusted, only scans
+taken while moving count against it.
 
-Off the map no point matches, and the odometry alone would move the estimate away without end. The estimate is held at the
-distance from the map's extent at which the radar still sees the map, and the filter reports that it is lost. The particles go
-on by odometry, so a vehicle that leaves the map and returns needs no search. The paper's filter has no such limit: when it
-is lost, its evaluation counts a failure and resets it (`rol.evaluation.FailureMonitor`).
+Off the map no point matches, and the odometry alone would move the estimate away without end. The estimate is
+held at the distance from the map's extent at which the radar still sees the map, and the filter reports that
+it is lost. The particles go on by odometry, so a vehicle that leaves the map and returns needs no search. The
+paper's filter has no such limit: when it is lost, its evaluation counts a failure and resets it
+(`rol.evaluation.FailureMonitor`).
 """
 
 from __future__ import annotations
@@ -56,15 +59,16 @@ class DetectionSettings:
     Attributes
     ----------
     search_below, lost_below : float
-        Normalized scores below which hypotheses are searched, and below which the filter reports that it is lost. At
-        correct poses on the real route 5 % of the averages over two seconds are below 0.6 and 1 % below 0.3; 20 m and
-        20 deg off, 95 % are below 0.2. Minus infinity switches a test off.
+        Normalized scores below which hypotheses are searched, and below which the filter reports that it is
+        lost. At correct poses on the real route 5 % of the averages over two seconds are below 0.6 and 1 %
+        below 0.3; 20 m and 20 deg off, 95 % are below 0.2. Minus infinity switches a test off.
     n_scans : int
         Scans averaged. 8: two seconds.
     trust_m : float
         After this distance with a high score an estimate is trusted, until a hypothesis replaces it [m].
     moved_m : float
-        A scan counts, for a trusted estimate, when the vehicle has moved this far since the last one that did [m].
+        A scan counts, for a trusted estimate, when the vehicle has moved this far since the last one that did
+        [m].
 
     Raises
     ------
@@ -94,18 +98,18 @@ class RelocalizationSettings:
     Attributes
     ----------
     n_clouds, length_m : int, float
-        Scans merged for a search, and the distance over which they may extend [m]. 16: in four seconds the odometry drifts
-        by less than one degree.
+        Scans merged for a search, and the distance over which they may extend [m]. 16: in four seconds the
+        odometry drifts by less than one degree.
     max_range_m : float
         Points farther away are left out, as the heading is too uncertain for them [m].
     pause, trusted_pause, far_pause : int
-        Scans between two searches: near, near while the estimate is trusted, and far. They are longer for a window that takes
-        longer to search, see `shortest_pause`.
+        Scans between two searches: near, near while the estimate is trusted, and far. They are longer for a
+        window that takes longer to search, see `shortest_pause`.
     reach_m, reach_yaw : float
         Half the extent of the near search around the estimate [m, rad].
     far_after : int
-        After this number of scans in a row with a score below ``lost_below`` the search is far, until an estimate is
-        trusted. 120: half a minute.
+        After this number of scans in a row with a score below ``lost_below`` the search is far, until an
+        estimate is trusted. 120: half a minute.
     far_reach_m : float
         Half the extent of the far search, in all headings [m].
     workers : int
@@ -144,9 +148,9 @@ class RelocalizationSettings:
 def shortest_pause(settings: RelocalizationSettings, is_far: bool) -> int:
     """Compute the number of scans between two searches at which a lost filter stays faster than the radar.
 
-    The cost of a search grows with the area that its window and the cloud cover, and with the number of headings; a far search
-    also refines a fixed number of poses. It is computed from the settings and not measured while the filter runs, so the
-    same scans always give the same estimates.
+    The cost of a search grows with the area that its window and the cloud cover, and with the number of
+    headings; a far search also refines a fixed number of poses. It is computed from the settings and not
+    measured while the filter runs, so the same scans always give the same estimates.
 
     Parameters
     ----------
@@ -162,9 +166,10 @@ def shortest_pause(settings: RelocalizationSettings, is_far: bool) -> int:
 
     Notes
     -----
-    Measured on one core of a virtual machine with two: a near search takes 0.21 s, a far one 2.5 s, and following 73 hypotheses
-    0.04 s per second of data. With the default pauses, 2 and 20 scans, a lost filter needs about half a second per second of
-    data. As a far search takes as long as ten scans, an application has to keep the scans that arrive meanwhile.
+    Measured on one core of a virtual machine with two: a near search takes 0.21 s, a far one 2.5 s, and
+    following 73 hypotheses 0.04 s per second of data. With the default pauses, 2 and 20 scans, a lost filter
+    needs about half a second per second of data. As a far search takes as long as ten scans, an application
+    has to keep the scans that arrive meanwhile.
     """
     range_m = min(settings.max_range_m, 64.0) + settings.length_m
     if is_far:
@@ -182,11 +187,11 @@ class ConfirmationSettings:
     n_scans : int
         Scans over which a hypothesis is followed first. 12: three seconds.
     margin, trusted_margin : float
-        Fraction of the reference contrast by which it must match better than the estimate, on average over these scans;
-        the second value for a trusted estimate.
+        Fraction of the reference contrast by which it must match better than the estimate, on average over
+        these scans; the second value for a trusted estimate.
     uniqueness, far_uniqueness : float
-        Fraction by which it must match better than every other hypothesis: in a repetitive street there is no decision
-        yet. The second value for far hypotheses, of which there are many more.
+        Fraction by which it must match better than every other hypothesis: in a repetitive street there is no
+        decision yet. The second value for far hypotheses, of which there are many more.
     n_hypotheses, n_far_hypotheses : int
         Largest number of hypotheses, near and far.
     n_particles : int
@@ -226,8 +231,8 @@ class RecoverySettings:
     stationary_m : float
         An increment shorter than this is that of a stationary vehicle [m].
     stationary_weight : float
-        Factor on the exponent of Eq. 8 for a stationary vehicle, whose scans show the same false points again and again
-        and are not independent.
+        Factor on the exponent of Eq. 8 for a stationary vehicle, whose scans show the same false points again
+        and again and are not independent.
     max_outside_m : float
         Largest distance of the estimate from the map's extent, in x and in y [m]. 64: the range of the radar.
     detection, relocalization, confirmation
@@ -309,7 +314,8 @@ class Hypotheses:
     def update(
         self, points: np.ndarray, grid: MapGrid, exponent: float, rng: np.random.Generator
     ) -> tuple[Hypotheses, np.ndarray]:
-        """Weight and resample the particles of each by one scan; return the score contrasts, too, shape (h,)."""
+        """Weight and resample the particles of each by one scan; return the score contrasts, too,
+        shape (h,)."""
         if not len(self) or not len(points):
             return self, np.zeros(len(self))
         h, k, _ = self.particles.shape
@@ -337,7 +343,8 @@ class Hypotheses:
         return self.keep(np.array(sorted(kept)[1:], dtype=int) - 1)
 
     def add(self, found: np.ndarray, pose: np.ndarray, n: int, rng: np.random.Generator) -> Hypotheses:
-        """Add poses that are neither the estimate nor a hypothesis yet, up to n in all; the worst old ones go."""
+        """Add poses that are neither the estimate nor a hypothesis yet, up to n in all;
+        the worst old ones go."""
         known = np.vstack([pose[None], self.poses])
         away = np.abs(found[:, None] - known[None])
         away[..., 2] = np.abs(wrap_angle(away[..., 2]))
@@ -440,14 +447,15 @@ class RecoveringFilter(ParticleFilter):
     start : array-like, shape (3,)
         Pose T_map_radar at the first scan [m, m, rad]; it may be wrong.
     settings : MclSettings
-        Of the filter, such as ``rol_beyond.robust.settings_for("robust", motion=MotionModel())``. The motion may be a
-        `MotionModel`, and the resampling a `KldResampling`.
+        Of the filter, such as ``rol_beyond.robust.settings_for("robust", motion=MotionModel())``. The motion
+        may be a `MotionModel`, and the resampling a `KldResampling`.
     recovery : RecoverySettings
         Detection, search and confirmation.
     rng : numpy.random.Generator
         Random generator.
     is_start_known : bool
-        False: the start is only the centre of the ``far_reach_m`` in which the vehicle is, its heading unknown.
+        False: the start is only the centre of the ``far_reach_m`` in which the vehicle is, its heading
+        unknown.
     grid : MapGrid, optional
         ``settings.measurement.build_grid(map_points)``, if it is available.
     """
@@ -481,7 +489,8 @@ class RecoveringFilter(ParticleFilter):
         self.clouds, self.increments = deque(maxlen=n_clouds), deque(maxlen=n_clouds - 1)
         self.scores = deque(maxlen=max(recovery.detection.n_scans, recovery.confirmation.n_scans))
         self.is_far, self.is_trusted, self.is_held, self.n_lost = False, False, False, 0
-        # Scans since the last search; distances since the last search, the last scan that counted, a low score.
+        # Scans since the last search; distances since the last search, the last scan that counted, a low
+        # score.
         self.since_search, self.searched_m, self.moved_m, self.high_score_m = 10**6, 1e9, 0.0, 0.0
 
     def step(self, points: np.ndarray, increment: np.ndarray | None = None) -> RecoveryUpdate:
@@ -593,7 +602,8 @@ class RecoveringFilter(ParticleFilter):
         return best if leads[best] > 0.0 else None
 
     def _find_winner(self) -> int | None:
-        """Find the hypothesis that replaces the estimate, if any: confirmed, better, unique, and with a high score."""
+        """Find the hypothesis that replaces the estimate, if any: confirmed, better, unique,
+        and with a high score."""
         limits, leader = self.recovery.confirmation, self._find_leader()
         if leader is None or self.hypotheses.ages[leader] < limits.n_scans:
             return None
@@ -619,7 +629,8 @@ class RecoveringFilter(ParticleFilter):
         self.is_far, self.is_trusted, self.n_lost, self.high_score_m = False, False, 0, 0.0
 
     def _is_search_due(self) -> bool:
-        """Check the pause since the last search, the number of scans, and the distance before a far search."""
+        """Check the pause since the last search, the number of scans,
+        and the distance before a far search."""
         settings, detection = self.recovery.relocalization, self.recovery.detection
         pause = settings.trusted_pause if self.is_trusted else settings.pause
         pause = settings.far_pause if self.is_far else pause
@@ -680,7 +691,8 @@ def mean_increment(increment: np.ndarray, motion: MotionModel) -> np.ndarray:
 
     Notes
     -----
-    ``motion.mean`` is exact. It differs from this by 12 mm and 5 mm (RMS, forward and left) and changes the RMSE over 1,500
-    scans of the real route by up to 1.4 mm, so the reference results would have to be renewed.
+    ``motion.mean`` is exact. It differs from this by 12 mm and 5 mm (RMS, forward and left) and changes the
+    RMSE over 1,500 scans of the real route by up to 1.4 mm, so the reference results would have to be
+    renewed.
     """
     return np.median(predict(np.zeros((256, 3)), increment, motion, np.random.default_rng(0)), axis=0)

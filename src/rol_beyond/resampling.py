@@ -64,7 +64,8 @@ def resample_systematic(weights: np.ndarray, rng: np.random.Generator, n: int | 
     Returns
     -------
     indices : array of int, shape (n,)
-        Particles to keep; index i occurs n * w_i times on average, and never differs from that by a full copy.
+        Particles to keep; index i occurs n * w_i times on average, and never differs from that by a full
+        copy.
     """
     n = len(weights) if n is None else n
     return pick_indices(check_weights(weights), (np.arange(n) + rng.random()) / n)

@@ -1,7 +1,8 @@
 """Settings of the method `robust`, next to those of the paper's method.
 
-The robust filter is the paper's (`rol.mcl`) with another measurement (`rol_beyond.likelihood_field`), another resampling
-(`rol_beyond.resampling`), a calibrated motion model (`rol_beyond.motion`) and recovery (`rol_beyond.recovery`).
+The robust filter is the paper's (`rol.mcl`) with another measurement (`rol_beyond.likelihood_field`), another
+resampling (`rol_beyond.resampling`), a calibrated motion model (`rol_beyond.motion`) and recovery
+(`rol_beyond.recovery`).
 """
 
 from __future__ import annotations
@@ -25,12 +26,12 @@ def settings_for(method: str, **changes: object) -> MclSettings:
     Parameters
     ----------
     method : str
-        "paper": matched counts to the power lambda, multinomial resampling after each scan. "robust": a likelihood field
-        that down-weights dense map regions, and KLD-sampling with systematic resampling when the effective sample size
-        falls below one half.
+        "paper": matched counts to the power lambda, multinomial resampling after each scan. "robust": a
+        likelihood field that down-weights dense map regions, and KLD-sampling with systematic resampling when
+        the effective sample size falls below one half.
     **changes
-        Values that differ from the method's, by the names of fields of `rol.mcl.MclSettings` or of its parts, such as
-        ``exponent``. ``n_particles`` also bounds the number of particles of `KldResampling`.
+        Values that differ from the method's, by the names of fields of `rol.mcl.MclSettings` or of its parts,
+        such as ``exponent``. ``n_particles`` also bounds the number of particles of `KldResampling`.
 
     Returns
     -------

@@ -1,8 +1,9 @@
 """Scan matching that goes beyond the paper: a correlative search for the initial guess, and scan-to-map ICP.
 
-Nearest neighbours pull two clouds of thick strokes together wherever they overlap already, so ICP stays close to its
-initial guess. `correlative_scan_match` evaluates a window of candidate poses instead. `scan_to_map_icp` registers every
-scan to the map without a filter; the paper rules this out (Sec. III-B), and it is compared with the filter here.
+Nearest neighbours pull two clouds of thick strokes together wherever they overlap already, so ICP stays close
+to its initial guess. `correlative_scan_match` evaluates a window of candidate poses instead.
+`scan_to_map_icp` registers every scan to the map without a filter; the paper rules this out (Sec. III-B), and
+it is compared with the filter here.
 """
 
 from __future__ import annotations
@@ -29,8 +30,8 @@ def correlative_scan_match(
 ) -> np.ndarray:
     """Match two clouds by evaluating candidate poses in a window, on a coarse grid and then on a fine one.
 
-    The score of a candidate is the number of source points that fall on marked cells of the target. It is largest at the
-    true motion, also where ICP would stay close to its initial guess.
+    The score of a candidate is the number of source points that fall on marked cells of the target. It is
+    largest at the true motion, also where ICP would stay close to its initial guess.
 
     Parameters
     ----------
@@ -48,14 +49,14 @@ def correlative_scan_match(
     Returns
     -------
     pose : array, shape (3,)
-        Best T_target_source, of equally good ones the nearest to the guess; the guess itself for an empty cloud.
-        Candidates are 0.4 m and 1 deg apart, then, within a fifth of the window, 0.08 m and 0.2 deg.
+        Best T_target_source, of equally good ones the nearest to the guess; the guess itself for an empty
+        cloud. Candidates are 0.4 m and 1 deg apart, then, within a fifth of the window, 0.08 m and 0.2 deg.
 
     Raises
     ------
     OdometryError
-        If a cloud has another shape or a value that is not finite, a setting is out of its range, or the clouds extend so
-        far that the grid would need more than 400 MB.
+        If a cloud has another shape or a value that is not finite, a setting is out of its range, or the
+        clouds extend so far that the grid would need more than 400 MB.
     """
     check_number("window", window, "[0, 100]", tuple, OdometryError)
     check_number("cell", cell, "(0, inf)", float, OdometryError)
@@ -93,8 +94,8 @@ class ScanToMapSettings:
     range_m : float
         Map points farther from the initial guess than this are ignored [m].
     min_inlier_ratio : float
-        A registration that does not converge, or in which a smaller fraction of the points is matched, is rejected.
-        Accepting all of them was worse on 2,000 scans of the real route.
+        A registration that does not converge, or in which a smaller fraction of the points is matched, is
+        rejected. Accepting all of them was worse on 2,000 scans of the real route.
     icp : IcpSettings
         Settings of the registration.
 
@@ -140,8 +141,9 @@ def scan_to_map_icp(
     Yields
     ------
     result : IcpResult
-        One per scan, the pose T_map_radar as ``T_target_source``. Where the registration is rejected this is the
-        initial guess, the last pose moved by the increment, and ``converged`` is False. Yin et al. 2020, Sec. III-B.
+        One per scan, the pose T_map_radar as ``T_target_source``. Where the registration is rejected this is
+        the initial guess, the last pose moved by the increment, and ``converged`` is False. Yin et al. 2020,
+        Sec. III-B.
 
     Raises
     ------

@@ -1,11 +1,12 @@
 """Global localization: exhaustive search of a pose on the map by FFT correlation.
 
-The match of a cloud at every place of a grid, in one heading, is the correlation of two images, the map's and the cloud's,
-and is computed with one Fourier transform each. Its cost does not depend on the number of points, so the clouds of several
-seconds, merged by odometry, are matched as fast as that of one scan.
+The match of a cloud at every place of a grid, in one heading, is the correlation of two images, the map's and
+the cloud's, and is computed with one Fourier transform each. Its cost does not depend on the number of
+points, so the clouds of several seconds, merged by odometry, are matched as fast as that of one scan.
 
-The score is not the number of points near the map but its contrast to chance: in a dense region points match in any
-heading, so the mean match over all headings is subtracted. The difference is called the *score contrast*.
+The score is not the number of points near the map but its contrast to chance: in a dense region points match
+in any heading, so the mean match over all headings is subtracted. The difference is called the *score
+contrast*.
 """
 
 from __future__ import annotations
@@ -152,8 +153,8 @@ def score_contrast(poses: np.ndarray, points: np.ndarray, grid: MapGrid) -> np.n
     Returns
     -------
     contrast : array, shape (n,)
-        Mean score of a point, minus its mean over headings at least 20 deg away; between -1 and 1, about 0 where the
-        cloud matches by chance, 0 for a cloud without points.
+        Mean score of a point, minus its mean over headings at least 20 deg away; between -1 and 1, about 0
+        where the cloud matches by chance, 0 for a cloud without points.
     """
     if len(points) == 0:
         return np.zeros(len(poses))
@@ -235,8 +236,8 @@ def search_poses(
     points : array, shape (n, 2)
         Cloud in the radar frame [m].
     coarse, fine : MapGrid
-        Map for the exhaustive search, and for the refinement of the best poses. They may be the same; with cells of 1 m
-        instead of 0.25 m, 300 m are searched as fast as 75 m, but less reliably.
+        Map for the exhaustive search, and for the refinement of the best poses. They may be the same; with
+        cells of 1 m instead of 0.25 m, 300 m are searched as fast as 75 m, but less reliably.
     centre : array, shape (3,)
         Centre of the window [m, m, rad].
     settings : SearchSettings
@@ -311,7 +312,8 @@ def _refine(
 def suppress_neighbours(
     poses: np.ndarray, order: np.ndarray, n: int, separation: tuple[float, float]
 ) -> list[int]:
-    """Go through poses in an order and keep those that are not close to one kept before (non-maximum suppression).
+    """Go through poses in an order and keep those that are not close to one kept before
+    (non-maximum suppression).
 
     Parameters
     ----------

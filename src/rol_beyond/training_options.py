@@ -44,7 +44,8 @@ def bce_loss(logits: Tensor, lidar: Tensor, pos_weight: float = 1.0) -> Tensor:
     Parameters
     ----------
     logits : tensor, shape (b, 1, h, w)
-        Output of `rol.pix2pix.Generator.logits`; the image is their tanh, so the log-odds are twice the logits.
+        Output of `rol.pix2pix.Generator.logits`; the image is their tanh, so the log-odds are twice the
+        logits.
     lidar : tensor, shape (b, 1, h, w)
         Lidar image in [-1, 1].
     pos_weight : float
@@ -69,7 +70,8 @@ def _weighted_mean(losses: Tensor, lidar: Tensor, pos_weight: float) -> Tensor:
 
 @dataclass(frozen=True)
 class TrainingExtensions:
-    """Departures from the paper's training, as hooks of `rol.training.train`; the defaults are the paper's."""
+    """Departures from the paper's training, as hooks of `rol.training.train`;
+    the defaults are the paper's."""
 
     architecture: str = "resnet"  # of the generator, see `rol.pix2pix.build_generator`
     adversarial: bool = True  # False: no discriminator, the pixel loss alone

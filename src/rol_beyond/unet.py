@@ -1,12 +1,12 @@
 """A second generator: a small U-Net that is fast on a CPU. Importing this module registers it as "unet".
 
-Images as in `rol.pix2pix`: (b, 1, h, w) in [-1, 1]. The image is folded (pixel unshuffle) by 4 in both directions
-before the first convolution, so that all computation takes place at a quarter of the resolution and below, and
-unfolded at the end; the receptive field of the deepest level covers most of the image. An additional channel holds the
-distance from the radar, because the width of the beam grows with range.
+Images as in `rol.pix2pix`: (b, 1, h, w) in [-1, 1]. The image is folded (pixel unshuffle) by 4 in both
+directions before the first convolution, so that all computation takes place at a quarter of the resolution
+and below, and unfolded at the end; the receptive field of the deepest level covers most of the image. An
+additional channel holds the distance from the radar, because the width of the beam grows with range.
 
-Batch norm keeps running statistics here. In inference it is a scale and a shift, which `UnetGenerator.fuse` merges into
-the convolution before it.
+Batch norm keeps running statistics here. In inference it is a scale and a shift, which `UnetGenerator.fuse`
+merges into the convolution before it.
 """
 
 from __future__ import annotations
@@ -47,8 +47,8 @@ class _Block(nn.Module):
 class UnetGenerator(Generator):
     """Generator: fold, three halvings with skip connections, unfold, tanh.
 
-    `ngf` is the number of channels of the first level, `n_blocks` that of residual blocks on each level and side;
-    other attributes as in `rol.pix2pix.Generator`.
+    `ngf` is the number of channels of the first level, `n_blocks` that of residual blocks on each level and
+    side; other attributes as in `rol.pix2pix.Generator`.
     """
 
     architecture, description = "unet", "folded u-net, running statistics, 1 to 1 channel"

@@ -1,7 +1,8 @@
 """Check the parameters of a chapter's notebook before it runs: names, types, and the folders that it reads.
 
-Papermill sets whatever it is given: text in place of a number, a name that no cell uses, a folder that is not there. A
-notebook calls `check_parameters` in its first cell below the parameters, so that such a run ends there.
+Papermill sets whatever it is given: text in place of a number, a name that no cell uses, a folder that is not
+there. A notebook calls `check_parameters` in its first cell below the parameters, so that such a run ends
+there.
 """
 
 from __future__ import annotations
@@ -58,16 +59,17 @@ def check_parameters(
     notebook : str
         Name of the notebook's file without its ending, such as "01_sessions".
     namespace : mapping
-        ``globals()`` of the notebook. Names are compared with the parameters at the first call only; later ones find
-        those of other cells as well.
+        ``globals()`` of the notebook. Names are compared with the parameters at the first call only; later
+        ones find those of other cells as well.
     optional : iterable of str
         Parameters whose file or folder may be missing.
 
     Raises
     ------
     ParameterError
-        If the notebook is not found, or a parameter is unknown, missing, of another type than its default, out of
-        range, none of its choices, or names a file, folder, session or network to read that is not there.
+        If the notebook is not found, or a parameter is unknown, missing, of another type than its default,
+        out of range, none of its choices, or names a file, folder, session or network to read that is not
+        there.
     """
     if Path.cwd().name == "notebooks":
         os.chdir("..")
@@ -168,7 +170,8 @@ def _type_fault(value: Any, default: Any) -> str:
 def _range_fault(name: str, value: Any, default: Any) -> str:
     """Describe why a value of the right type is out of range; empty if it is not.
 
-    Only numbers with a negative default may be negative. Counts, whole numbers with a default above 0, start at 1.
+    Only numbers with a negative default may be negative. Counts, whole numbers with a default above 0, start
+    at 1.
     """
     if name in CHOICES:
         known = ", ".join(map(repr, CHOICES[name]))

@@ -1,7 +1,7 @@
 """Animations for a page, drawn by the browser, with a button and a slider.
 
-A film of thousands of moving dots is large and blurred. So the page holds their coordinates and a short script that
-draws them; of images it holds small compressed ones. Nothing is loaded from elsewhere.
+A film of thousands of moving dots is large and blurred. So the page holds their coordinates and a short
+script that draws them; of images it holds small compressed ones. Nothing is loaded from elsewhere.
 """
 
 from __future__ import annotations
@@ -134,7 +134,8 @@ def play_images(
     description : str
         Description of the animation for screen readers.
     colours : mapping of str to str
-        Panels that are drawn in one colour, "#RRGGBB", wherever they are not 0; the others are grey, dark on white.
+        Panels that are drawn in one colour, "#RRGGBB", wherever they are not 0; the others are grey, dark on
+        white.
     metres_across : float
         Edge of what an image shows [m].
     size : int
@@ -150,7 +151,8 @@ def play_images(
     Raises
     ------
     ValueError
-        If there is no image, a panel has another number of them than there are texts, or an image is not of grey values.
+        If there is no image, a panel has another number of them than there are texts, or an image is not of
+        grey values.
     """
     if not texts or not panels:
         raise ValueError("no image to play")

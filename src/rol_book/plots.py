@@ -717,7 +717,8 @@ def draw_polar(
 
 
 def draw_range_image(ax: Axes, ranges: np.ndarray, *, max_range: float = 50.0) -> Axes:
-    """Draw the ranges of a sweep as stored: a row per laser, a column per firing; white where nothing came back.
+    """Draw the ranges of a sweep as stored: a row per laser, a column per firing;
+    white where nothing came back.
 
     Parameters
     ----------

@@ -1,6 +1,7 @@
 """A progress bar for long work, shown only in a terminal and in a notebook that is open in Jupyter.
 
-Notebooks that papermill runs are stored with their outputs, and logs are read line by line: a bar would clutter both.
+Notebooks that papermill runs are stored with their outputs, and logs are read line by line: a bar would
+clutter both.
 """
 
 from __future__ import annotations

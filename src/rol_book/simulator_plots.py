@@ -25,7 +25,8 @@ def draw_statistics(found: Mapping[str, dict]) -> Figure:
     Parameters
     ----------
     found : mapping
-        Name of a set -> its statistics, from `rol_study.radar_statistics.scan_statistics`; three sets at most, drawn in turn.
+        Name of a set -> its statistics, from `rol_study.radar_statistics.scan_statistics`; three sets at
+        most, drawn in turn.
 
     Returns
     -------
@@ -133,8 +134,9 @@ def draw_lidar_statistics(found: Mapping[str, dict]) -> Figure:
     Parameters
     ----------
     found : mapping
-        Name of a set -> its statistics, from `rol_study.lidar_statistics.compare_sweeps`, of the left lidar; two sets at most, and parts
-        of the first one, whose curves are thin: they show how much the statistics vary within it.
+        Name of a set -> its statistics, from `rol_study.lidar_statistics.compare_sweeps`, of the left lidar;
+        two sets at most, and parts of the first one, whose curves are thin: they show how much the statistics
+        vary within it.
 
     Returns
     -------

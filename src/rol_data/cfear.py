@@ -1,8 +1,9 @@
 """Read CFEAR-3 radar odometry of two of the paper's sessions (Adolfsson et al., T-RO 2023).
 
-CFEAR registers oriented surface points to keyframes and is the most accurate published radar odometry of these sessions.
-Its files hold one pose per radar scan, as the first three rows of a 4 x 4 matrix (KITTI), with y to the right and yaw
-clockwise; here y is left and yaw counter-clockwise. The files lie below `real_root`, see `rol_data.rall`.
+CFEAR registers oriented surface points to keyframes and is the most accurate published radar odometry of
+these sessions. Its files hold one pose per radar scan, as the first three rows of a 4 x 4 matrix (KITTI),
+with y to the right and yaw clockwise; here y is left and yaw counter-clockwise. The files lie below
+`real_root`, see `rol_data.rall`.
 """
 
 from __future__ import annotations
@@ -63,7 +64,8 @@ def load_cfear_poses(path: Path | str) -> np.ndarray:
     Parameters
     ----------
     path : path
-        Rows of twelve numbers, a 3 x 4 matrix each: rotation and translation of a scan in the frame of the first.
+        Rows of twelve numbers, a 3 x 4 matrix each: rotation and translation of a scan in the frame of the
+        first.
 
     Returns
     -------
@@ -98,9 +100,9 @@ def load_cfear_poses(path: Path | str) -> np.ndarray:
 def load_cfear_increments(path: Path | str, n_scans: int) -> np.ndarray:
     """Read the odometry increments of a session.
 
-    Pose i belongs to scan i, the row i of RaLL's ground truth. The published files lack the pose of the last scan, so the
-    increment to it is missing. A pose beyond the last scan, as of a session whose first or last stamp has no ground truth,
-    is left out.
+    Pose i belongs to scan i, the row i of RaLL's ground truth. The published files lack the pose of the last
+    scan, so the increment to it is missing. A pose beyond the last scan, as of a session whose first or last
+    stamp has no ground truth, is left out.
 
     Parameters
     ----------
@@ -117,7 +119,8 @@ def load_cfear_increments(path: Path | str, n_scans: int) -> np.ndarray:
     Raises
     ------
     CfearError
-        If the file is faulty, see `load_cfear_poses`, or its number of poses differs from ``n_scans`` by more than one.
+        If the file is faulty, see `load_cfear_poses`, or its number of poses differs from ``n_scans`` by more
+        than one.
     """
     poses = load_cfear_poses(path)
     if abs(len(poses) - n_scans) > 1:

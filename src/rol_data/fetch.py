@@ -1,8 +1,8 @@
 """Fetch listed files of public Git repositories at pinned commits, and compare their checksums.
 
-Only the listed files are transferred (partial clone, sparse checkout, one commit deep). Each one is put in its place
-after its checksum was compared, so a run after an interruption continues with the files that are missing. Files that
-are not listed stay as they are.
+Only the listed files are transferred (partial clone, sparse checkout, one commit deep). Each one is put in
+its place after its checksum was compared, so a run after an interruption continues with the files that are
+missing. Files that are not listed stay as they are.
 """
 
 from __future__ import annotations
@@ -27,7 +27,8 @@ class FetchError(RuntimeError):
 
 
 def load_list(path: Path) -> list[dict]:
-    """Read the list of repositories, each with its commit, terms, size [bytes] and the SHA-256 of every file."""
+    """Read the list of repositories, each with its commit, terms,
+    size [bytes] and the SHA-256 of every file."""
     return json.loads(path.read_text(encoding="utf-8"))["repositories"]
 
 
@@ -74,7 +75,8 @@ def make_clone(clone: Path, url: str, commit: str) -> None:
 
 
 def fetch_files(clone: Path, commit: str, names: list[str], digests: dict[str, str], folder: Path) -> None:
-    """Check some files out of a clone, compare their checksums, and move them into the folder of the repository.
+    """Check some files out of a clone, compare their checksums,
+    and move them into the folder of the repository.
 
     Raises
     ------

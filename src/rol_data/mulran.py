@@ -1,8 +1,9 @@
-"""Read MulRan (Kim et al. 2020): polar scans of a Navtech CIR204-H, keyframe clouds of an Ouster OS1-64, and calibration.
+"""Read MulRan (Kim et al. 2020): polar scans of a Navtech CIR204-H, keyframe clouds of an Ouster OS1-64,
+and calibration.
 
-The form of the scans is Oxford's with other numbers: 3360 bins, times in nanoseconds. Two scans of KAIST03 come with
-sparolab/referee and 21 keyframe clouds of the same drive with gisbi-kim/SC-A-LOAM; RaLL has a map and poses of the place.
-Frames: x forward, y left, z up [m], except for the lidar, which faces backward.
+The form of the scans is Oxford's with other numbers: 3360 bins, times in nanoseconds. Two scans of KAIST03
+come with sparolab/referee and 21 keyframe clouds of the same drive with gisbi-kim/SC-A-LOAM; RaLL has a map
+and poses of the place. Frames: x forward, y left, z up [m], except for the lidar, which faces backward.
 """
 
 from __future__ import annotations
@@ -64,7 +65,8 @@ def load_scan(path: Path | str) -> MulranScan:
     Parameters
     ----------
     path : path
-        8-bit grey PNG of 400 rows and 3371 columns: time in ns (8 bytes), encoder count (2), flag (1), 3360 bins.
+        8-bit grey PNG of 400 rows and 3371 columns: time in ns (8 bytes), encoder count (2), flag (1), 3360
+        bins.
 
     Returns
     -------
@@ -73,8 +75,8 @@ def load_scan(path: Path | str) -> MulranScan:
     Raises
     ------
     MulranError
-        If the file is missing, no such image, or has no header: times that are not those of one turn, or counts that do
-        not go once around.
+        If the file is missing, no such image, or has no header: times that are not those of one turn, or
+        counts that do not go once around.
     """
     path = Path(path)
     image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED) if path.is_file() else None
@@ -186,6 +188,7 @@ def radar_from_lidar() -> np.ndarray:
 
 
 def load_kaist_map(real_root: Path | str) -> np.ndarray:
-    """Read RaLL's map of KAIST, shape (n, 2) [m]; a `rol_data.rall.RallError` if it is missing or at fault."""
+    """Read RaLL's map of KAIST, shape (n, 2) [m];
+    a `rol_data.rall.RallError` if it is missing or at fault."""
     points = rall.load_map_points(Path(real_root) / KAIST_MAP_PATH, KAIST_SHAPE)
     return points + (np.array(KAIST_CORNER) - rall.MAP_CORNER)

@@ -1,9 +1,11 @@
-"""Find real pairs: raw Oxford radar scans with lidar sweeps of the same moment, wherever they lie below a folder.
+"""Find real pairs: raw Oxford radar scans with lidar sweeps of the same moment,
+wherever they lie below a folder.
 
-Public repositories hold pieces of the data set in layouts of their own: scans in one folder, sweeps in another, a
-list of stamps one level higher, one lidar instead of two. Files are recognized by their name (16 digits, a stamp in
-microseconds) and by their form, and each sweep is assigned to a lidar by its folder or by the list of stamps that
-names it. What belongs nowhere is left out and reported in `RealPairs.faults`; a file that is damaged raises.
+Public repositories hold pieces of the data set in layouts of their own: scans in one folder, sweeps in
+another, a list of stamps one level higher, one lidar instead of two. Files are recognized by their name
+(16 digits, a stamp in microseconds) and by their form, and each sweep is assigned to a lidar by its folder or
+by the list of stamps that names it. What belongs nowhere is left out and reported in `RealPairs.faults`; a
+file that is damaged raises.
 """
 
 from __future__ import annotations
@@ -76,8 +78,8 @@ class PairedScan:
     stamp_us, mid_us : int
         Its name, the time of the first row, and mid-scan [us].
     twist : tuple of float, or None
-        Body velocity [m/s, m/s, rad/s] by the official odometry beside the scans; None where that does not cover
-        the scan.
+        Body velocity [m/s, m/s, rad/s] by the official odometry beside the scans; None where that does not
+        cover the scan.
     pose : array, shape (3,), or None
         Pose at mid-scan in the frame of that odometry [m, m, rad].
     odometry_path : Path or None
@@ -139,15 +141,16 @@ def find_pairs(
     real_root : path
         Folder to look in.
     scan_patterns, sweep_patterns : sequence of str
-        Where to look for the files below it, as patterns of `glob.glob`; everywhere but in hidden folders if not given.
+        Where to look for the files below it, as patterns of `glob.glob`; everywhere but in hidden folders if
+        not given.
 
     Returns
     -------
     pairs : RealPairs
-        Empty without scans or sweeps. A sweep is in a folder `velodyne_left` or `velodyne_right`, or is named in
-        the nearest list of that name (`velodyne_left.timestamps`) above it; where there is such a list, a sweep
-        that it does not name or flags 0 is left out. Of two files with the same stamp and sensor the first path
-        counts.
+        Empty without scans or sweeps. A sweep is in a folder `velodyne_left` or `velodyne_right`, or is named
+        in the nearest list of that name (`velodyne_left.timestamps`) above it; where there is such a list, a
+        sweep that it does not name or flags 0 is left out. Of two files with the same stamp and sensor the
+        first path counts.
 
     Raises
     ------
@@ -176,8 +179,8 @@ def load_sweep_points(sweep: Sweep, span_s: float = SWEEP_SECONDS) -> tuple[np.n
     sweep : Sweep
         The file.
     span_s : float
-        Duration of the sweep [s], used for .bin files only: these hold no times, so a point's time is the stamp plus
-        this duration multiplied by `firing_fractions`.
+        Duration of the sweep [s], used for .bin files only: these hold no times, so a point's time is the
+        stamp plus this duration multiplied by `firing_fractions`.
 
     Returns
     -------
@@ -206,8 +209,8 @@ def firing_fractions(points: np.ndarray) -> np.ndarray:
     Parameters
     ----------
     points : array, shape (n, 3) or more columns
-        Points in the lidar frame (y left), laser after laser as in Oxford's .bin files, or firing after firing; in
-        either case those of one laser in the order of time [m].
+        Points in the lidar frame (y left), laser after laser as in Oxford's .bin files, or firing after
+        firing; in either case those of one laser in the order of time [m].
 
     Returns
     -------
@@ -216,8 +219,8 @@ def firing_fractions(points: np.ndarray) -> np.ndarray:
 
     Notes
     -----
-    The lidar turns clockwise at a constant rate. Where a sweep is a little longer than a turn, the points of its
-    last degrees get the time of the first ones.
+    The lidar turns clockwise at a constant rate. Where a sweep is a little longer than a turn, the points of
+    its last degrees get the time of the first ones.
     """
     clockwise = _clockwise(points)
     return np.mod(clockwise - sweep_start(points), 2.0 * np.pi) / (2.0 * np.pi) if len(points) else clockwise
@@ -254,7 +257,8 @@ def _clockwise(points: np.ndarray) -> np.ndarray:
 
 
 def _find_frames(root: Path, patterns: Sequence[str]) -> list[Path]:
-    """List the files that patterns match and whose names are stamps; folders that are links are searched as well."""
+    """List the files that patterns match and whose names are stamps;
+    folders that are links are searched as well."""
     names = {name for pattern in patterns for name in glob(pattern, root_dir=root, recursive=True)}
     paths = sorted(root / name for name in names)
     return [p for p in paths if p.stem.isdecimal() and len(p.stem) == STAMP_DIGITS and p.is_file()]
@@ -345,7 +349,8 @@ def _count(path: Path, items: list, what: str) -> list[str]:
 
 
 def _describe_scans(paths: list[Path]) -> tuple[list[PairedScan], list[str]]:
-    """Look up mid-scan time, velocity and pose of scans in the odometry beside them; name odometry with gaps."""
+    """Look up mid-scan time, velocity and pose of scans in the odometry beside them;
+    name odometry with gaps."""
     known: dict[Path | None, dict[int, tuple]] = {None: {}}
     scans, faults = [], []
     for path in paths:
@@ -361,7 +366,8 @@ def _describe_scans(paths: list[Path]) -> tuple[list[PairedScan], list[str]]:
 
 
 def _load_motion(path: Path) -> tuple[dict[int, tuple], str]:
-    """Read mid-scan time, velocity and pose of every scan of an odometry; none and the fault if it has a gap."""
+    """Read mid-scan time, velocity and pose of every scan of an odometry;
+    none and the fault if it has a gap."""
     odometry = load_radar_odometry(path)
     try:
         stamps, mids, poses = compose_odometry(odometry)

@@ -1,9 +1,9 @@
 """Read lidar maps, ground truth and radar odometry of Oxford and MulRan sessions, and single scans.
 
-The paper's first author published them with a later work (Yin et al., "RaLL", T-ITS 2021), of the paper's own sessions
-and of three places of MulRan (Kim et al., ICRA 2020), see `PLACES`. The files lie in a folder that is called
-`real_root`, in the layout of the public repositories, see `data/README.md`. All poses are (x, y, yaw) in the frame of
-the map [m, m, rad], y left, yaw counter-clockwise.
+The paper's first author published them with a later work (Yin et al., "RaLL", T-ITS 2021), of the paper's own
+sessions and of three places of MulRan (Kim et al., ICRA 2020), see `PLACES`. The files lie in a folder that
+is called `real_root`, in the layout of the public repositories, see `data/README.md`. All poses are
+(x, y, yaw) in the frame of the map [m, m, rad], y left, yaw counter-clockwise.
 """
 
 from __future__ import annotations
@@ -71,7 +71,8 @@ class Place:
 
 
 def _mulran(name: str, shape: tuple[int, int], corner: tuple[float, float]) -> Place:
-    """Describe a place of MulRan; the names of its odometry files begin with a capital letter, or are an acronym."""
+    """Describe a place of MulRan; the names of its odometry files begin with a capital letter,
+    or are an acronym."""
     title = name.upper() if name == "dcc" else name.capitalize()
     path = Path(f"RaLL/data/maps/MulRan/png/laser_map_{name}.png")
     poses = f"RaLL/data/gt_poses/MulRan/pose_{name}_{{}}.txt"
@@ -277,8 +278,8 @@ def load_odometry(path: Path | str) -> np.ndarray:
     Returns
     -------
     increments : array, shape (n, 3)
-        Odometry increments [m, m, rad]. Some files hold one row more or fewer than there are increments between the
-        poses, see `rol_study.oxford_route.match_increments`.
+        Odometry increments [m, m, rad]. Some files hold one row more or fewer than there are increments
+        between the poses, see `rol_study.oxford_route.match_increments`.
 
     Raises
     ------
@@ -335,8 +336,9 @@ def load_scans(real_root: Path | str) -> list[RealScan]:
     -------
     scans : list of RealScan
         In the order of time: every scan under ``RadarSLAMPy/data/tiny/radar`` with a row in
-        ``oxford_scan_map_poses.csv``, see `find_scan_poses`. The velocity is that of the official odometry beside the
-        scans; outside its span, that between the poses of neighbours less than a second away, if there is one.
+        ``oxford_scan_map_poses.csv``, see `find_scan_poses`. The velocity is that of the official odometry
+        beside the scans; outside its span, that between the poses of neighbours less than a second away, if
+        there is one.
 
     Raises
     ------
@@ -373,8 +375,8 @@ def load_posed_scans(real_root: Path | str) -> list[RealScan]:
     -------
     scans : list of RealScan
         Every scan under ``radar-localization/test`` in the order of time, none if there is none. Row i of
-        ``pose_xy_01.txt`` is the pose of scan i of the official odometry, at mid-scan; the velocity is that of the
-        official odometry.
+        ``pose_xy_01.txt`` is the pose of scan i of the official odometry, at mid-scan; the velocity is that
+        of the official odometry.
 
     Raises
     ------

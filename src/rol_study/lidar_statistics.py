@@ -1,9 +1,10 @@
-"""Compute statistics of HDL-32E sweeps, real or simulated: beams, returns, ranges, heights, noise, intensities.
+"""Compute statistics of HDL-32E sweeps, real or simulated: beams, returns, ranges, heights, noise,
+intensities.
 
-Sweeps are points in the frame of the left lidar as `rol.oxford.load_sweep` returns them, shape (n, 4): x, y, z [m]
-and intensity. Laser and angle of a point are recovered from its place, since a .bin stores neither. Statistics of the
-sensor and the car (beams, noise, losses, view past the car) hold anywhere; those of ranges, heights and intensities
-depend on the scene as well.
+Sweeps are points in the frame of the left lidar as `rol.oxford.load_sweep` returns them, shape (n, 4): x, y,
+z [m] and intensity. Laser and angle of a point are recovered from its place, since a .bin stores neither.
+Statistics of the sensor and the car (beams, noise, losses, view past the car) hold anywhere; those of ranges,
+heights and intensities depend on the scene as well.
 """
 
 from __future__ import annotations
@@ -132,7 +133,8 @@ def recover_beams(points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarra
 
 
 def angle_step(angles_deg: np.ndarray) -> float:
-    """Estimate the angle between two firings [deg] from the distinct angles, rounded to 0.01 deg, of a sweep."""
+    """Estimate the angle between two firings [deg] from the distinct angles, rounded to 0.01 deg,
+    of a sweep."""
     steps = np.diff(np.unique(np.rint(100.0 * np.asarray(angles_deg)).astype(int))) / 100.0
     steps = (
         steps[np.abs(steps - np.median(steps)) < 0.03] if len(steps) else steps
@@ -158,8 +160,9 @@ def return_fractions(sweeps: Sequence[np.ndarray], min_range_m: float = NEAR_M) 
     Returns
     -------
     fractions : array, shape (32, 72)
-        By laser and 5 deg of angle. Firings are counted where a sweep begins and ends, since two sweeps differ by a
-        packet there, and follow from the step elsewhere, since firings without a return leave no trace.
+        By laser and 5 deg of angle. Firings are counted where a sweep begins and ends, since two sweeps
+        differ by a packet there, and follow from the step elsewhere, since firings without a return leave no
+        trace.
     """
     counts, firings = np.zeros((len(ELEVATIONS_DOWN), AZIMUTH_CELLS)), np.zeros(AZIMUTH_CELLS)
     for points in sweeps:
@@ -176,8 +179,8 @@ def return_fractions(sweeps: Sequence[np.ndarray], min_range_m: float = NEAR_M) 
 def range_noise(points: np.ndarray, range_limits_m: tuple[float, float] = (2.0, 20.0)) -> float:
     """Estimate the noise of a range from second differences along the scan lines.
 
-    On a smooth surface r[i-1] - 2 r[i] + r[i+1] is noise with six times the variance of a single range. The median
-    absolute deviation ignores edges. Offsets between lasers cancel.
+    On a smooth surface r[i-1] - 2 r[i] + r[i+1] is noise with six times the variance of a single range. The
+    median absolute deviation ignores edges. Offsets between lasers cancel.
 
     Parameters
     ----------
@@ -223,8 +226,8 @@ def plane_noise(
     Returns
     -------
     noise_m : dict
-        "ground" (normal within 26 deg of the vertical) and "walls" (within 17 deg of the horizontal): median of the
-        residuals' root mean square, divided by the cosine of incidence [m]; NaN without a plane.
+        "ground" (normal within 26 deg of the vertical) and "walls" (within 17 deg of the horizontal): median
+        of the residuals' root mean square, divided by the cosine of incidence [m]; NaN without a plane.
     """
     lasers, _, ranges = recover_beams(points)
     is_used = (ranges > 2.0) & (ranges < 20.0)
@@ -244,7 +247,8 @@ def plane_noise(
 
 
 def histograms(sweeps: Sequence[np.ndarray]) -> dict[str, np.ndarray]:
-    """Compute the histograms of ranges, heights and intensities of points beyond the own car, each of sum one.
+    """Compute the histograms of ranges, heights and intensities of points beyond the own car,
+    each of sum one.
 
     Parameters
     ----------
@@ -254,8 +258,8 @@ def histograms(sweeps: Sequence[np.ndarray]) -> dict[str, np.ndarray]:
     Returns
     -------
     fractions : dict
-        "ranges" [m], "heights" in the radar frame [m], "intensities", in the bins of `EDGES`; points outside count
-        in the first or last bin.
+        "ranges" [m], "heights" in the radar frame [m], "intensities", in the bins of `EDGES`; points outside
+        count in the first or last bin.
     """
     points = np.concatenate(sweeps)
     ranges = recover_beams(points)[2]
@@ -283,14 +287,14 @@ def sweep_statistics(sweeps: Sequence[np.ndarray], rng: np.random.Generator, *, 
     Returns
     -------
     statistics : dict
-        "sweeps", "points": array, shape (n_sweeps,); "laser_counts": array, shape (32,), mean points of each laser;
-        "step_deg"; "first_angles_deg": array, shape (n_sweeps,); "return_fractions": array, shape (32, 72);
-        "no_return": fraction of all beams without a point beyond the car; "blocked": fraction of the cells of
-        laser and angle in which less than 2 % of the beams return; "steep_returns": fraction of beams of the five steepest lasers
-        that return beside the car; "near": fraction of points within 1.9 m; "ground": fraction of the other
-        points that are ground; "range_noise_m", "ground_noise_m", "wall_noise_m" [m]; "ground_intensity",
-        "other_intensity": medians; "reach_m": range below which 99.9 % of the points lie; "max_range_m"; "histograms"
-        and their "edges".
+        "sweeps", "points": array, shape (n_sweeps,); "laser_counts": array, shape (32,), mean points of each
+        laser; "step_deg"; "first_angles_deg": array, shape (n_sweeps,); "return_fractions": array, shape
+        (32, 72); "no_return": fraction of all beams without a point beyond the car; "blocked": fraction of
+        the cells of laser and angle in which less than 2 % of the beams return; "steep_returns": fraction of
+        beams of the five steepest lasers that return beside the car; "near": fraction of points within 1.9 m;
+        "ground": fraction of the other points that are ground; "range_noise_m", "ground_noise_m",
+        "wall_noise_m" [m]; "ground_intensity", "other_intensity": medians; "reach_m": range below which 99.9
+        % of the points lie; "max_range_m"; "histograms" and their "edges".
 
     Raises
     ------
@@ -351,9 +355,9 @@ def compare_sweeps(
     Returns
     -------
     statistics : dict
-        Name -> result of `sweep_statistics` with two more keys. "is_part": True for the halves. "distances": Hellinger
-        distances of the histograms, by name: of a half to the other half, of another set to the real sweeps; NaN
-        without a reference.
+        Name -> result of `sweep_statistics` with two more keys. "is_part": True for the halves. "distances":
+        Hellinger distances of the histograms, by name: of a half to the other half, of another set to the
+        real sweeps; NaN without a reference.
     """
     middle = (len(real) + 1) // 2
     halves = dict(zip(HALVES, (real[:middle], real[-middle:]), strict=True)) if len(real) > 1 else {}

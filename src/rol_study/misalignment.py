@@ -1,7 +1,8 @@
 """Measure how far the radar image and the lidar image of a pair are shifted against each other.
 
-Both images have the sensor in the middle, row 0 farthest forward, column 0 farthest left. A shift is where the radar
-shows what the lidar shows: positive rows lie behind, positive columns to the right, positive ranges farther out.
+Both images have the sensor in the middle, row 0 farthest forward, column 0 farthest left. A shift is where
+the radar shows what the lidar shows: positive rows lie behind, positive columns to the right, positive ranges
+farther out.
 """
 
 from __future__ import annotations

@@ -61,8 +61,8 @@ def evaluate_on_keyframe(points: Mapping[str, np.ndarray], keyframe: np.ndarray)
     Returns
     -------
     table : pandas.DataFrame
-        One row per front end: ``points``, ``n``, ``share_1m``, ``share_2m`` (precision), ``reached_1m`` (recall, of the
-        lidar points within the range of the images), ``chance_1m``, ``chance_2m``.
+        One row per front end: ``points``, ``n``, ``share_1m``, ``share_2m`` (precision), ``reached_1m``
+        (recall, of the lidar points within the range of the images), ``chance_1m``, ``chance_2m``.
     """
     near, rows = crop_range(keyframe, MAX_RANGE_M, MIN_RANGE_M), []
     for name, cloud in points.items():
@@ -147,7 +147,8 @@ def poses_at(poses: np.ndarray, first_s: float, seconds: np.ndarray, period_s: f
 def find_pose_frame(clouds: Sequence[np.ndarray], poses: np.ndarray, map_points: np.ndarray) -> np.ndarray:
     """Find where the radar is in the frame of published poses: fit lidar clouds to the map.
 
-    A street hardly constrains the position along it, so the fit begins at several positions and the best one counts.
+    A street hardly constrains the position along it, so the fit begins at several positions and the best one
+    counts.
 
     Parameters
     ----------
@@ -190,8 +191,8 @@ class MulranStudy:
     frame : array, shape (j, 3)
         Pose of the radar in the frame of the published poses, by keyframe [m, m, rad].
     offsets : pandas.DataFrame
-        By range offset [m]: ``score`` of the raw peaks fitted to the keyframe, and the motion of the fit, ``forward_m``,
-        ``left_m``, ``turn_deg``; means over the scans.
+        By range offset [m]: ``score`` of the raw peaks fitted to the keyframe, and the motion of the fit,
+        ``forward_m``, ``left_m``, ``turn_deg``; means over the scans.
     """
 
     points: list[dict[str, np.ndarray]]

@@ -1,7 +1,8 @@
 """Real routes: lidar maps, ground-truth poses and radar odometry of Oxford, the paper's place, and of MulRan.
 
-The paper's back end can be run on its own sessions: map, ground truth and odometry are public. Only the measurement, the
-generated lidar points, is not, so it is an argument of the experiments (`rol_study.route_experiments`).
+The paper's back end can be run on its own sessions: map, ground truth and odometry are public. Only the
+measurement, the generated lidar points, is not, so it is an argument of the experiments
+(`rol_study.route_experiments`).
 """
 
 from __future__ import annotations
@@ -47,7 +48,8 @@ class RouteSession:
     odometry : str
         Where the increments come from, one of `ODOMETRIES`.
     is_faulty : array of bool, shape (n,), optional
-        Scans whose ground truth the authors' odometry contradicts, see `rol_study.truth_faults`; none known if not given.
+        Scans whose ground truth the authors' odometry contradicts, see `rol_study.truth_faults`; none known
+        if not given.
     """
 
     number: str
@@ -116,8 +118,8 @@ def select_sessions(
     real_root : path
         Folder of the real data.
     session : str
-        A number, or "all": the paper's four sessions of Oxford (02, 07, 08, 10) and, of another place, all but the session
-        that its map was made from. A session that is not at hand is left out of "all".
+        A number, or "all": the paper's four sessions of Oxford (02, 07, 08, 10) and, of another place, all
+        but the session that its map was made from. A session that is not at hand is left out of "all".
     place, odometry : str
         As for `list_sessions`.
 
@@ -177,14 +179,14 @@ def load_session(
     Returns
     -------
     session : RouteSession
-        Where the odometry has a row more or fewer than there are increments between the poses, `match_increments` decides
-        what is left out.
+        Where the odometry has a row more or fewer than there are increments between the poses,
+        `match_increments` decides what is left out.
 
     Raises
     ------
     RouteError
-        If the number of odometry rows differs by more than one, a pose is farther from the map's extent than the radar's
-        range, or the odometry is unknown.
+        If the number of odometry rows differs by more than one, a pose is farther from the map's extent than
+        the radar's range, or the odometry is unknown.
     rol_data.rall.RallError, rol_data.cfear.CfearError
         If a file is missing or has anything but rows of finite numbers, or the place is unknown.
     """
@@ -236,9 +238,9 @@ def match_increments(
     Returns
     -------
     poses : array, shape (m, 3)
-        All poses where k >= n - 1. For k = n - 2 the odometry lacks a scan that the ground truth has: that is a pose which
-        exactly repeats the one before it between two steps of more than half a metre, as in DCC03. It is left out or, where
-        no pose repeats, the last one.
+        All poses where k >= n - 1. For k = n - 2 the odometry lacks a scan that the ground truth has: that is
+        a pose which exactly repeats the one before it between two steps of more than half a metre, as in
+        DCC03. It is left out or, where no pose repeats, the last one.
     increments : array, shape (m - 1, 3)
         Without the last row where k = n, as in two files of Oxford.
 
@@ -265,8 +267,8 @@ def published_motion() -> MotionModel:
     Returns
     -------
     model : MotionModel
-        The authors' increments are 1.5 % short; the radar is 1.2 m ahead of the axle, so a turn moves it sideways; a
-        stationary vehicle seems to turn.
+        The authors' increments are 1.5 % short; the radar is 1.2 m ahead of the axle, so a turn moves it
+        sideways; a stationary vehicle seems to turn.
     """
     return MotionModel(
         matrix=((1.0155, -0.0757, 0.0791), (0.0030, 0.0736, 1.2125), (-0.0001, 0.0040, 1.0142)),
@@ -288,15 +290,16 @@ def published_reference_contrast(precision_1m: float) -> float:
     Returns
     -------
     reference_contrast : float
-        That of the method `robust`, see `rol_beyond.recovery.measure_reference_contrast`, with sampled points at the
-        ground-truth poses of session 01: rounded, for four front ends, linearly interpolated, and beyond them that of the
-        nearest.
+        That of the method `robust`, see `rol_beyond.recovery.measure_reference_contrast`, with sampled points
+        at the ground-truth poses of session 01: rounded, for four front ends, linearly interpolated, and
+        beyond them that of the nearest.
     """
     return float(np.interp(precision_1m, *PUBLISHED_CONTRASTS))
 
 
 def exact_motion() -> MotionModel:
-    """Give the motion model of the true increments: no correction, and the least noise that keeps the particles apart."""
+    """Give the motion model of the true increments: no correction,
+    and the least noise that keeps the particles apart."""
     sigmas = tuple(map(float, MIN_SIGMAS))
     return MotionModel(sigma_stationary=sigmas, sigma_base=sigmas, sigma_per_metre=(0.0, 0.0, 0.0))
 
@@ -308,7 +311,8 @@ def calibrate_on_another(
     place: str = "oxford",
     odometry: str = "rall",
 ) -> tuple[MotionModel, str, np.ndarray]:
-    """Calibrate the motion model on another session of the place: the mapping session 01 or, for itself, the next one.
+    """Calibrate the motion model on another session of the place: the mapping session 01 or, for itself,
+    the next one.
 
     Parameters
     ----------
@@ -319,13 +323,14 @@ def calibrate_on_another(
     map_points : array, shape (m, 2)
         The map [m].
     place, odometry : str
-        As for `load_session`; the model is that of this odometry. That of the true increments is `exact_motion`.
+        As for `load_session`; the model is that of this odometry. That of the true increments is
+        `exact_motion`.
 
     Returns
     -------
     model : MotionModel
-        Where there is no other session, `published_motion` for the authors' odometry of Oxford, else `MotionModel` with its
-        defaults.
+        Where there is no other session, `published_motion` for the authors' odometry of Oxford, else
+        `MotionModel` with its defaults.
     calibration_session : str
         Number of the session used, or "".
     poses : array, shape (n, 3)

@@ -22,7 +22,8 @@ def lateral_offsets(
     poses, reference : array, shape (n, 3) and (m, 3)
         Poses of the two sessions in the same frame [m, m, rad].
     max_m, max_turn : float
-        A pose farther than this from the nearest one of the other session, or of another heading, has no offset [m, rad].
+        A pose farther than this from the nearest one of the other session, or of another heading, has no
+        offset [m, rad].
 
     Returns
     -------

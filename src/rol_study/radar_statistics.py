@@ -259,8 +259,8 @@ def motion_statistics(
 ) -> dict:
     """Measure the effect of motion compensation and Doppler correction on the agreement of scans.
 
-    Scans some metres apart are aligned by their known poses. An object ahead in the first is abeam in the second, so
-    a range error ahead reduces their correlation.
+    Scans some metres apart are aligned by their known poses. An object ahead in the first is abeam in the
+    second, so a range error ahead reduces their correlation.
 
     Parameters
     ----------
@@ -278,10 +278,10 @@ def motion_statistics(
     Returns
     -------
     statistics : dict
-        "metres_per_turn": mean distance driven in a turn; "correlation_raw", "correlation_motion", "correlation_both": mean
-        correlation of the Cartesian images of such pairs, uncorrected, with motion
-        compensation, and with the best Doppler shift as well; "doppler_seconds": that shift [s], positive where what is
-        ahead reads nearer; "doppler_curve": correlation of every shift tried.
+        "metres_per_turn": mean distance driven in a turn; "correlation_raw", "correlation_motion",
+        "correlation_both": mean correlation of the Cartesian images of such pairs, uncorrected, with motion
+        compensation, and with the best Doppler shift as well; "doppler_seconds": that shift [s], positive
+        where what is ahead reads nearer; "doppler_curve": correlation of every shift tried.
     """
     odometry, increments = relative_pose(poses[:-1], poses[1:]), relative_pose(poses[:-lag], poses[lag:])
     twists = np.vstack([odometry, odometry[-1:]]) / scan_seconds
@@ -320,7 +320,8 @@ def _mean_correlation(
     away = np.hypot(*(np.mgrid[:width, :width] - middle)) * pixel
     own = np.where((away > 4.0) & (away < 50.0), np.float32(0.0), np.float32(np.nan))  # no leakage
     for before, after, (x, y, yaw) in zip(images[:-lag], images[lag:], increments, strict=True):
-        # Column c and row r show the place (middle - r, middle - c) * pixel; both axes fall, so a turn stays one.
+        # Column c and row r show the place (middle - r, middle - c) * pixel; both axes fall, so a turn stays
+        # one.
         c, s = np.cos(yaw), np.sin(yaw)
         forward = np.array([[c, s, 0.0], [-s, c, 0.0]])
         forward[:, 2] = np.array([-y, -x]) / pixel + middle - forward[:, :2] @ (middle, middle)
@@ -341,11 +342,12 @@ def scan_statistics(codes: np.ndarray) -> dict:
     Returns
     -------
     statistics : dict
-        "histogram": fraction of every code; "fractions": code -> fraction of pixels at or above it; "zero_fractions": range [m] -> fraction of code 0 in quiet
-        bins; "range_correlation": of the noise at lags 1-7 bins; "azimuth_correlation"; "near_field": range
-        [m] -> mean code; "near_copies": True when bins 0-4 are identical; "floors": class of peak -> far
-        floor; "point_spread": levels [dB] by distance; "forbidden": number of pixels with a code that cannot
-        occur; "greatest": greatest code; "fractions_40_by_range": fraction of codes >= 40 by range, edges [m] as keys.
+        "histogram": fraction of every code; "fractions": code -> fraction of pixels at or above it;
+        "zero_fractions": range [m] -> fraction of code 0 in quiet bins; "range_correlation": of the noise at
+        lags 1-7 bins; "azimuth_correlation"; "near_field": range [m] -> mean code; "near_copies": True when
+        bins 0-4 are identical; "floors": class of peak -> far floor; "point_spread": levels [dB] by distance;
+        "forbidden": number of pixels with a code that cannot occur; "greatest": greatest code;
+        "fractions_40_by_range": fraction of codes >= 40 by range, edges [m] as keys.
 
     Raises
     ------
@@ -478,7 +480,8 @@ def map_fractions(
 def relate_to_lidar(
     codes: np.ndarray, azimuths: np.ndarray, points: np.ndarray, calibration: RangeCalibration
 ) -> dict[str, float]:
-    """Compare the raw radar peaks and the lidar points of one moment, within 20 m of the car, in both directions.
+    """Compare the raw radar peaks and the lidar points of one moment, within 20 m of the car,
+    in both directions.
 
     Parameters
     ----------
@@ -494,8 +497,8 @@ def relate_to_lidar(
     Returns
     -------
     relation : dict
-        "peaks" and "lidar points": their numbers; "peaks with a lidar point within ... m", "lidar points with a peak within
-        ... m": fractions [0..1].
+        "peaks" and "lidar points": their numbers; "peaks with a lidar point within ... m", "lidar points with
+        a peak within ... m": fractions [0..1].
     """
     peaks = k_strongest_peaks(codes, azimuths, 12, 70, range_limits_m=(2.5, 30.0), calibration=calibration)
     points = crop_range(remove_ground(points), 30.0, 2.5)[:, :2]

@@ -1,8 +1,9 @@
 """Compare real radar scans with the lidar sweeps of the same moment: alignment, calibration, similarity.
 
 Everything is in the radar frame, x forward, y left [m], and refers to a scan and its sweeps as
-`rol_data.oxford_pairs.find_pairs` finds them. "Compensated" means that radar and lidar are brought to mid-scan by the
-velocity of the official odometry and that the radar's Doppler shift is removed; "none" leaves both as recorded.
+`rol_data.oxford_pairs.find_pairs` finds them. "Compensated" means that radar and lidar are brought to
+mid-scan by the velocity of the official odometry and that the radar's Doppler shift is removed; "none" leaves
+both as recorded.
 """
 
 from __future__ import annotations
@@ -99,7 +100,8 @@ class Pair:
 
     @cached_property
     def tops(self) -> np.ndarray:
-        """Height above the ground of the highest point in the pixel of each of the lidar points, shape (m,) [m]."""
+        """Height above the ground of the highest point in the pixel of each of the lidar points,
+        shape (m,) [m]."""
         height, forward, left = np.nan_to_num(fit_ground(self.cloud))
         around = np.clip(self.objects[:, :2], -15.0, 15.0)  # farther away the slope is not known
         ground = (height or -2.0) + around @ (forward, left)
@@ -144,9 +146,10 @@ def load_scan_pairs(
     Returns
     -------
     pairs : dict
-        (motion, sweeps) -> `Pair`. Motion "compensated" is left out where the velocity is unknown. Sweeps "nearest"
-        are of each lidar the sweep nearest to the scan's stamp (the paper's rule), with compensation the one nearest
-        to mid-scan; left out if none is within 50 ms. Sweeps "turn" are all with a stamp inside the scan's turn.
+        (motion, sweeps) -> `Pair`. Motion "compensated" is left out where the velocity is unknown. Sweeps
+        "nearest" are of each lidar the sweep nearest to the scan's stamp (the paper's rule), with
+        compensation the one nearest to mid-scan; left out if none is within 50 ms. Sweeps "turn" are all with
+        a stamp inside the scan's turn.
 
     Raises
     ------
@@ -187,7 +190,8 @@ def load_cloud(sweep: Sweep, scan: PairedScan, twist: Sequence[float] | None = N
 
 
 def load_path(scan: PairedScan) -> np.ndarray | None:
-    """Load the path of the odometry that a scan belongs to, shape (m, 3) [m, m, rad]; None without odometry."""
+    """Load the path of the odometry that a scan belongs to, shape (m, 3) [m, m, rad];
+    None without odometry."""
     if scan.odometry_path is None:
         return None
     return compose_odometry(load_radar_odometry(scan.odometry_path))[2]
@@ -263,8 +267,9 @@ def locate_stamp(
 ) -> tuple[float, float, int]:
     """Estimate where within a sweep its stamp lies, from the lengths of sweeps that differ.
 
-    The time between two stamps is ``(1 - place) * own + place * next``, with the durations of the sweep and of the
-    next one: the first alone if a stamp is the beginning of its sweep, the second alone if it is the end.
+    The time between two stamps is ``(1 - place) * own + place * next``, with the durations of the sweep and
+    of the next one: the first alone if a stamp is the beginning of its sweep, the second alone if it is the
+    end.
 
     Parameters
     ----------
@@ -318,8 +323,8 @@ def sweep_consistency(
     odometry_path : path
         Odometry of the radar; sweeps outside its span are left out.
     spans_s : sequence of float
-        Durations to try: 0.05 for a turn with the stamp at its beginning, 0 for all points at once, -0.05 for points
-        fired the other way round [s].
+        Durations to try: 0.05 for a turn with the stamp at its beginning, 0 for all points at once, -0.05 for
+        points fired the other way round [s].
     lag : int
         Sweeps between the two that are compared.
     n_pairs : int
@@ -328,8 +333,8 @@ def sweep_consistency(
     Returns
     -------
     distances : array, shape (n_pairs, s)
-        Mean distance of the later sweep's points to the earlier one's, each limited to 0.5 m [m]; no row with too few
-        sweeps.
+        Mean distance of the later sweep's points to the earlier one's, each limited to 0.5 m [m]; no row with
+        too few sweeps.
     """
     _, mids, poses = compose_odometry(load_radar_odometry(odometry_path))
     kept = [s for s in sweeps if mids[0] < s.stamp_us < mids[-1] - 100_000]
@@ -565,8 +570,8 @@ def _beam_at(
 def measure_walls(pairs: Sequence[Pair], calibration: Calibration) -> pd.DataFrame:
     """Find walls that lidar and radar see in the same direction.
 
-    A wall is the first surface in the direction of a radar row, if its lidar points within 0.35 m of range span 1.5 m of
-    height or more. Its radar echo is the strongest one within 1.2 m.
+    A wall is the first surface in the direction of a radar row, if its lidar points within 0.35 m of range
+    span 1.5 m of height or more. Its radar echo is the strongest one within 1.2 m.
 
     Parameters
     ----------
@@ -578,8 +583,9 @@ def measure_walls(pairs: Sequence[Pair], calibration: Calibration) -> pd.DataFra
     Returns
     -------
     walls : pandas.DataFrame
-        One row per wall and radar row: ``scan`` (number of the pair), ``range_m`` by the lidar, as the moving radar
-        would measure it with the Doppler shift, ``bin`` of the echo, ``aside`` (absolute sine of the bearing).
+        One row per wall and radar row: ``scan`` (number of the pair), ``range_m`` by the lidar, as the moving
+        radar would measure it with the Doppler shift, ``bin`` of the echo, ``aside`` (absolute sine of the
+        bearing).
     """
     found = []
     for number, pair in enumerate(pairs):
@@ -626,8 +632,8 @@ def fit_ranges(walls: pd.DataFrame) -> tuple[np.ndarray, np.ndarray]:
     Returns
     -------
     values, errors : array, shape (2,)
-        Resolution and offset [m], and their standard errors by leaving out one scan at a time; nan with fewer than
-        20 walls.
+        Resolution and offset [m], and their standard errors by leaving out one scan at a time; nan with fewer
+        than 20 walls.
     """
 
     def fit(table: pd.DataFrame) -> np.ndarray:
@@ -660,11 +666,12 @@ def calibrate(pairs: Sequence[Pair]) -> tuple[pd.DataFrame, pd.DataFrame]:
     Returns
     -------
     table : pandas.DataFrame
-        Columns ``value`` and ``error`` (standard error) of ``rotation_deg``, ``forward_m``, ``left_m`` (fitted together),
-        the rotation by points near and far from the radar alone, ``delay_ms``, ``doppler_s`` (fitted together with a
-        rotation and a shift to the left), ``resolution_m`` and ``offset_m`` (fitted to the walls), and the offset with
-        that resolution by walls beside, and ahead or behind, alone; ``beyond_m``, the median distance by which the
-        ranges used in this project show walls too far away.
+        Columns ``value`` and ``error`` (standard error) of ``rotation_deg``, ``forward_m``, ``left_m``
+        (fitted together), the rotation by points near and far from the radar alone, ``delay_ms``,
+        ``doppler_s`` (fitted together with a rotation and a shift to the left), ``resolution_m`` and
+        ``offset_m`` (fitted to the walls), and the offset with that resolution by walls beside, and ahead or
+        behind, alone; ``beyond_m``, the median distance by which the ranges used in this project show walls
+        too far away.
     walls : pandas.DataFrame
         As of `measure_walls`.
     """
@@ -702,13 +709,14 @@ def fit_ground(cloud: np.ndarray, radius_m: float = 25.0, near: float = 0.5) -> 
     radius_m : float
         Points farther away are left out [m].
     near : float
-        The first plane is level, at the most frequent height below -1 m; points within this distance of a plane
-        count for the next one, which then shrinks to 0.15 m [m].
+        The first plane is level, at the most frequent height below -1 m; points within this distance of a
+        plane count for the next one, which then shrinks to 0.15 m [m].
 
     Returns
     -------
     height, forward, left : float
-        Height below the radar [m] and slopes, rise per metre forward and to the left; nan with fewer than 100 points.
+        Height below the radar [m] and slopes, rise per metre forward and to the left; nan with fewer than 100
+        points.
     """
     points = crop_range(cloud, radius_m, 3.0)[:, :3]
     points = points[(points[:, 2] < -1.0) & (points[:, 2] > -3.5)]
@@ -736,8 +744,8 @@ def distance_from_path(points: np.ndarray, scan: PairedScan, path: np.ndarray | 
     scan : PairedScan
         The scan.
     path : array, shape (m, 3), or None
-        Poses in the frame of ``scan.pose`` [m, m, rad], continued straight on for 80 m at both ends; without it the
-        path is a straight line through the radar.
+        Poses in the frame of ``scan.pose`` [m, m, rad], continued straight on for 80 m at both ends; without
+        it the path is a straight line through the radar.
 
     Returns
     -------
@@ -770,9 +778,9 @@ def describe_points(points: np.ndarray, pair: Pair, path: np.ndarray | None = No
     Returns
     -------
     table : pandas.DataFrame
-        One row per point: ``distance_m`` to the nearest lidar point, ``top_m`` (highest lidar point in that pixel, above
-        the ground), ``from_path_m``, and ``is_hidden``: more than 1 m farther than the first lidar point in its
-        direction, where the lidar cannot confirm or refute it.
+        One row per point: ``distance_m`` to the nearest lidar point, ``top_m`` (highest lidar point in that
+        pixel, above the ground), ``from_path_m``, and ``is_hidden``: more than 1 m farther than the first
+        lidar point in its direction, where the lidar cannot confirm or refute it.
     """
     distances, nearest = cKDTree(pair.lidar_points).query(points)
     others = crop_range(pair.lidar_points, min_range=OWN_VEHICLE_M)
@@ -788,7 +796,8 @@ def describe_points(points: np.ndarray, pair: Pair, path: np.ndarray | None = No
 
 
 def _first_ranges(points: np.ndarray, lidar: np.ndarray, n_sectors: int = 360) -> np.ndarray:
-    """Find the range of the nearest lidar point within 1.5 sectors of each point's direction; infinite without one [m]."""
+    """Find the range of the nearest lidar point within 1.5 sectors of each point's direction;
+    infinite without one [m]."""
     sector, own = (
         (np.mod(np.arctan2(p[:, 1], p[:, 0]), 2.0 * np.pi) / (2.0 * np.pi) * n_sectors).astype(int)
         % n_sectors
@@ -802,7 +811,8 @@ def _first_ranges(points: np.ndarray, lidar: np.ndarray, n_sectors: int = 360) -
 def tabulate_kinds(
     pairs: Sequence[Pair], points: Sequence[Mapping[str, np.ndarray]], path: np.ndarray | None = None
 ) -> pd.DataFrame:
-    """Tabulate where the points of front ends lie, which are right, and what the lidar has where they are wrong.
+    """Tabulate where the points of front ends lie, which are right,
+    and what the lidar has where they are wrong.
 
     Parameters
     ----------
@@ -817,8 +827,8 @@ def tabulate_kinds(
     -------
     table : pandas.DataFrame
         One row per front end, percentages over all pairs: of ``points`` by distance from the path; of these
-        ``within 1 m`` of a lidar point; of the ``lidar points reached`` within 1 m, by the height of the highest in the
-        pixel; and of points ``over 2 m off``, all and those in view, see `describe_points`.
+        ``within 1 m`` of a lidar point; of the ``lidar points reached`` within 1 m, by the height of the
+        highest in the pixel; and of points ``over 2 m off``, all and those in view, see `describe_points`.
     """
     found, lidar = [], []
     for pair, clouds in zip(pairs, points, strict=True):
@@ -850,7 +860,8 @@ def tabulate_kinds(
 def tabulate_corrected(
     pairs: Sequence[Pair], points: Sequence[Mapping[str, np.ndarray]], rotation_deg: float, beyond_m: float
 ) -> pd.DataFrame:
-    """Compare points as they are, and with a rotation and a range error removed, with the lidar points of pairs.
+    """Compare points as they are, and with a rotation and a range error removed,
+    with the lidar points of pairs.
 
     Parameters
     ----------
@@ -866,7 +877,8 @@ def tabulate_corrected(
     Returns
     -------
     table : pandas.DataFrame
-        One row per front end; of "as is" and "corrected" the percentages within 0.25, 0.5 and 1 m, means over pairs.
+        One row per front end; of "as is" and "corrected" the percentages within 0.25, 0.5 and 1 m, means over
+        pairs.
     """
     rows = []
     for pair, clouds in zip(pairs, points, strict=True):
@@ -904,8 +916,8 @@ def tabulate_on_map(
     Returns
     -------
     table : pandas.DataFrame
-        Rows "lidar, nearest", "lidar, turn" and the front ends: ``share_1m`` and ``share_2m`` (0..1) and ``n`` points,
-        means over scans. Empty without a scan on the map.
+        Rows "lidar, nearest", "lidar, turn" and the front ends: ``share_1m`` and ``share_2m`` (0..1) and
+        ``n`` points, means over scans. Empty without a scan on the map.
     """
     rows = []
     for of_scan, clouds in zip(pairs, points, strict=True):

@@ -1,4 +1,5 @@
-"""Real radar scans on a real lidar map: precision of front ends, choice of thresholds, localization from wrong starts."""
+"""Real radar scans on a real lidar map: precision of front ends, choice of thresholds,
+localization from wrong starts."""
 
 from __future__ import annotations
 
@@ -130,8 +131,8 @@ def evaluate_front_ends(
     Returns
     -------
     table : pandas.DataFrame
-        One row per scan and front end: ``timestamp_us``, ``points`` (the front end), ``n``, ``share_1m``, ``share_2m``,
-        ``chance_1m``, ``chance_2m``.
+        One row per scan and front end: ``timestamp_us``, ``points`` (the front end), ``n``, ``share_1m``,
+        ``share_2m``, ``chance_1m``, ``chance_2m``.
     results : list of tuple
         Points, radar image and generated image of the chosen network, per scan.
     """
@@ -218,7 +219,8 @@ def foggy_points(
 def evaluate_pairs(
     points: Iterable[Mapping[str, np.ndarray]], sweeps: Iterable[np.ndarray], reach_m: float
 ) -> pd.DataFrame:
-    """Compare the points of front ends with the sweeps of the same moments within a range, in both directions.
+    """Compare the points of front ends with the sweeps of the same moments within a range,
+    in both directions.
 
     Parameters
     ----------
@@ -232,7 +234,8 @@ def evaluate_pairs(
     Returns
     -------
     table : pandas.DataFrame
-        One row per pair and front end: ``points``, ``n``, ``share_1m``, ``share_2m`` (precision), ``reached_1m`` (recall).
+        One row per pair and front end: ``points``, ``n``, ``share_1m``, ``share_2m`` (precision),
+        ``reached_1m`` (recall).
     """
     rows = []
     for found, sweep in zip(points, sweeps, strict=True):
@@ -363,7 +366,8 @@ def localize_from_starts(
 
 
 def position_and_heading_errors(poses: np.ndarray, truth: np.ndarray) -> np.ndarray:
-    """Compute the distance [m] and the angle [deg] to the true poses, shape (..., 2); leading axes broadcast."""
+    """Compute the distance [m] and the angle [deg] to the true poses, shape (..., 2);
+    leading axes broadcast."""
     x, y, yaw = np.moveaxis(relative_pose(truth, poses), -1, 0)
     return np.stack([np.hypot(x, y), np.rad2deg(np.abs(yaw))], axis=-1)
 
@@ -385,8 +389,9 @@ def summarize_starts(
     Returns
     -------
     summary : dict
-        ``median``: medians per scan, shape (k, 2); ``worst``: largest errors from ``first_scan`` on, shape (2,); ``met``:
-        fraction of the runs that stay within the limits from then on. NaN where no group is long enough.
+        ``median``: medians per scan, shape (k, 2); ``worst``: largest errors from ``first_scan`` on, shape
+        (2,); ``met``: fraction of the runs that stay within the limits from then on. NaN where no group is
+        long enough.
     """
     longest = max(e.shape[1] for e in errors)
     median = [
@@ -478,13 +483,14 @@ def evaluate_turn(
     map_points : array, shape (m, 2)
         Points of the map [m].
     localize : callable
-        Takes points, the true pose and the map and returns errors, shape (s, 2) [m, deg]; see `localize_points`.
+        Takes points, the true pose and the map and returns errors, shape (s, 2) [m, deg]; see
+        `localize_points`.
 
     Returns
     -------
     table : pandas.DataFrame
-        One row per variant and front end: fractions ``share_1m`` and ``share_2m`` at the true pose; medians ``m`` and ``deg``
-        and the largest ``worst_m`` of the errors.
+        One row per variant and front end: fractions ``share_1m`` and ``share_2m`` at the true pose; medians
+        ``m`` and ``deg`` and the largest ``worst_m`` of the errors.
     points : dict
         (variant, front end) -> points, shape (n, 2) [m].
     """

@@ -1,8 +1,9 @@
-"""A submap of real lidar sweeps: placed along the official odometry, accumulated, and registered onto the published map.
+"""A submap of real lidar sweeps: placed along the official odometry, accumulated,
+and registered onto the published map.
 
-The sweeps are those of the left HDL-32E around the eleven real radar scans of `rol_data.rall.load_scans`. A `.bin` holds
-the points in the order in which they were fired, but neither their times nor the meaning of the sweep's stamp, so the
-position of the stamp within the sweep is an argument.
+The sweeps are those of the left HDL-32E around the eleven real radar scans of `rol_data.rall.load_scans`. A
+`.bin` holds the points in the order in which they were fired, but neither their times nor the meaning of the
+sweep's stamp, so the position of the stamp within the sweep is an argument.
 """
 
 from __future__ import annotations
@@ -68,7 +69,8 @@ class PlacedSweeps:
     odometry_poses: np.ndarray
 
     def scan_poses(self, stamps_us: Iterable[int]) -> np.ndarray:
-        """Give the poses of radar scans at mid-scan, shape (j, 3); a SubmapError for a scan without odometry."""
+        """Give the poses of radar scans at mid-scan, shape (j, 3);
+        a SubmapError for a scan without odometry."""
         row = {int(stamp): i for i, stamp in enumerate(self.odometry_stamps_us)}
         missing = [stamp for stamp in stamps_us if int(stamp) not in row]
         if missing:
@@ -241,8 +243,9 @@ def register_segments(
     Returns
     -------
     table : pandas.DataFrame
-        One row per segment: ``first``, ``last`` sweep, ``speed_mps``, and the motion from the pose of the whole submap to
-        that of the segment in the vehicle's frame at mid-segment: ``forward_m``, ``left_m``, ``heading_deg``.
+        One row per segment: ``first``, ``last`` sweep, ``speed_mps``, and the motion from the pose of the
+        whole submap to that of the segment in the vehicle's frame at mid-segment: ``forward_m``, ``left_m``,
+        ``heading_deg``.
     """
     rows = []
     for first, end in pairwise(edges):
@@ -298,8 +301,9 @@ def find_changes(
     reach_m : float
         Points farther from all poses are left out [m].
     radius_m : float
-        A point of the submap is new if no map point is within this radius; a map point is gone if most of the sweeps
-        that say anything about it saw past it by more than this, and confirmed if most of them met it [m].
+        A point of the submap is new if no map point is within this radius; a map point is gone if most of the
+        sweeps that say anything about it saw past it by more than this, and confirmed if most of them met it
+        [m].
 
     Returns
     -------
@@ -316,7 +320,8 @@ def find_changes(
 
 
 def sharpest_angle(angles: np.ndarray, counts: np.ndarray) -> float:
-    """Find the minimum of the parabola through the counts of `measure_sharpness`, in the unit of the angles."""
+    """Find the minimum of the parabola through the counts of `measure_sharpness`,
+    in the unit of the angles."""
     square, slope, _ = np.polyfit(angles, counts, 2)
     return float(-slope / (2.0 * square))
 
@@ -326,8 +331,8 @@ def measure_sharpness(
 ) -> np.ndarray:
     """Count the cells that a submap occupies when all sweeps are rotated by the same angle.
 
-    With a wrong rotation between lidar and odometry, a wall seen from several poses is drawn several times, so the
-    right rotation needs the fewest cells.
+    With a wrong rotation between lidar and odometry, a wall seen from several poses is drawn several times,
+    so the right rotation needs the fewest cells.
 
     Parameters
     ----------
@@ -355,8 +360,9 @@ def count_sightings(
 ) -> np.ndarray:
     """Count how often the lidar saw past map points, and how often it met them.
 
-    A point counts as seen past when all returns in its direction (one degree) are farther away than the point by more
-    than the margin. Points closer behind something are hidden, and directions without a return say nothing.
+    A point counts as seen past when all returns in its direction (one degree) are farther away than the point
+    by more than the margin. Points closer behind something are hidden, and directions without a return say
+    nothing.
 
     Parameters
     ----------
@@ -372,7 +378,8 @@ def count_sightings(
     Returns
     -------
     counts : array, shape (m, 2), int
-        Number of sweeps that saw past each point, and of those that had their nearest return within the margin of it.
+        Number of sweeps that saw past each point, and of those that had their nearest return within the
+        margin of it.
     """
     counts = np.zeros((len(points), 2), dtype=int)
     for cloud, pose in zip(clouds, poses, strict=True):

@@ -1,7 +1,8 @@
-"""Render points on the real route: simulated radar scans at the true poses of a real session, through a network.
+"""Render points on the real route: simulated radar scans at the true poses of a real session,
+through a network.
 
-The public data hold map, poses and odometry of the paper's sessions, but no scans. So the scans are simulated in a world
-that is built from the real map.
+The public data hold map, poses and odometry of the paper's sessions, but no scans. So the scans are simulated
+in a world that is built from the real map.
 """
 
 from __future__ import annotations
@@ -31,8 +32,8 @@ def build_segment(
 ) -> SimulatedSession:
     """Build a simulated session along a segment of a real session's trajectory.
 
-    The map and the poses are real, and with them speed and stops. The radar, the heights and materials of the world, the
-    changes since the map was made and the traffic are simulated.
+    The map and the poses are real, and with them speed and stops. The radar, the heights and materials of the
+    world, the changes since the map was made and the traffic are simulated.
 
     Parameters
     ----------
@@ -43,7 +44,8 @@ def build_segment(
     first_scan, n_scans : int
         First scan in ``pose_xy_<number>.txt``, and number of scans: at least 3, or 0 for all that follow.
     seed : int
-        Draws all that is simulated: the same seed gives the same world for all sessions, each on a day of its own.
+        Draws all that is simulated: the same seed gives the same world for all sessions, each on a day of its
+        own.
     **changes
         Settings of `SessionSettings` other than `STREET`, such as ``changed_share``.
 
@@ -61,9 +63,9 @@ def build_segment(
 
     Notes
     -----
-    The public poses have no times: scans are assumed to be a quarter of a second apart, with the radar's own spread of
-    1.5 ms. In memory are the map and the world within 180 m of the segment. Changes since the map was made are drawn for a
-    segment: another ``first_scan`` or ``n_scans`` is another day.
+    The public poses have no times: scans are assumed to be a quarter of a second apart, with the radar's own
+    spread of 1.5 ms. In memory are the map and the world within 180 m of the segment. Changes since the map
+    was made are drawn for a segment: another ``first_scan`` or ``n_scans`` is another day.
     """
     name, path = f"sim-rendered-{number}", Path(real_root) / rall.POSES_PATH / f"pose_xy_{number}.txt"
     own = {
@@ -87,7 +89,8 @@ def render_points(
     bf16: bool = False,
     tta_rotations: int | None = None,
 ) -> Iterator[np.ndarray]:
-    """Generate the lidar points of a simulated session, scan by scan: radar scan, motion compensation, network.
+    """Generate the lidar points of a simulated session, scan by scan: radar scan, motion compensation,
+    network.
 
     Parameters
     ----------
@@ -105,11 +108,12 @@ def render_points(
 
     Notes
     -----
-    Motion is compensated as in the pipeline, but by the velocity of the true poses, one-sided at the ends of the segment:
-    errors of an odometry do not enter.
+    Motion is compensated as in the pipeline, but by the velocity of the true poses, one-sided at the ends of
+    the segment: errors of an odometry do not enter.
 
-    The network `unet` was trained on this route, in such a world of seed 21: on scans 0 to 4999 of session 02 but for the
-    surroundings of the eleven real scans and of one more place (``sets`` in its card). Its points there are too good.
+    The network `unet` was trained on this route, in such a world of seed 21: on scans 0 to 4999 of session 02
+    but for the surroundings of the eleven real scans and of one more place (``sets`` in its card). Its points
+    there are too good.
     """
     how = {"bf16": bf16, "tta_rotations": tta_rotations}
     for index, twist in enumerate(true_twists(session)):
@@ -118,7 +122,8 @@ def render_points(
 
 
 def true_twists(session: SimulatedSession) -> np.ndarray:
-    """Compute the body velocity at every scan from the true poses, as `rol.pairs.estimate_twists` does from an odometry.
+    """Compute the body velocity at every scan from the true poses,
+    as `rol.pairs.estimate_twists` does from an odometry.
 
     Parameters
     ----------

@@ -1,8 +1,8 @@
 """Experiments on the real route with sampled points: runs of the filters, kidnapping, global localization.
 
-Map, ground truth and odometry are the authors' own; the points of each scan are sampled from the map at the true pose
-(`rol_study.sampled_points`). What a filter needs beforehand, the motion model and the reference contrast, is calibrated on
-another session.
+Map, ground truth and odometry are the authors' own; the points of each scan are sampled from the map at the
+true pose (`rol_study.sampled_points`). What a filter needs beforehand, the motion model and the reference
+contrast, is calibrated on another session.
 """
 
 from __future__ import annotations
@@ -66,7 +66,8 @@ class RouteExperiment:
         Ground-truth poses of the whole session, for `parts`, and of the other one, for `reference_contrast`
         [m, m, rad].
     parts : array, shape (3,)
-        Parts of near points, points beside and false ones that have the front end's precision over the whole session.
+        Parts of near points, points beside and false ones that have the front end's precision over the whole
+        session.
     motion : MotionModel
         Calibrated on the session `calibration_session`.
     calibration_session : str
@@ -304,7 +305,8 @@ def run_scan_to_map(
     rule: FailureRule | None = None,
     settings: ScanToMapSettings | None = None,
 ) -> FilterRun:
-    """Register each scan to the map by ICP, without a filter, with a reset to the ground truth after each failure.
+    """Register each scan to the map by ICP, without a filter,
+    with a reset to the ground truth after each failure.
 
     Parameters
     ----------
@@ -318,8 +320,8 @@ def run_scan_to_map(
     Returns
     -------
     run : FilterRun
-        ``is_lost`` marks rejected registrations; there are no covariances, no normalized score and no particles (NaN, NaN
-        and 0). Yin et al. 2020, Sec. III-B.
+        ``is_lost`` marks rejected registrations; there are no covariances, no normalized score and no
+        particles (NaN, NaN and 0). Yin et al. 2020, Sec. III-B.
     """
     monitor = FailureMonitor(session.stamps_us, session.truth, rule or FailureRule())
     settings, start = settings or ScanToMapSettings(), session.truth[0]
@@ -413,10 +415,11 @@ class RecoveryTrial:
     Attributes
     ----------
     found_s : float
-        Time after which the estimate was correct, and stayed so for two seconds [s]; infinite if it never was.
+        Time after which the estimate was correct, and stayed so for two seconds [s]; infinite if it never
+        was.
     told_share : float
-        Fraction of the scans with a wrong estimate, after the first two seconds, at which the filter reported that it was
-        lost; NaN if there were none.
+        Fraction of the scans with a wrong estimate, after the first two seconds, at which the filter reported
+        that it was lost; NaN if there were none.
     error_m : float
         Position error at the end [m].
     is_lost_at_end : bool
@@ -496,8 +499,8 @@ def run_from(
     experiment : RouteExperiment
         Session, map and calibration.
     first, n_scans : int
-        First scan, and the largest number of scans; a run from an unknown start ends two seconds after the filter has
-        reported that it is not lost.
+        First scan, and the largest number of scans; a run from an unknown start ends two seconds after the
+        filter has reported that it is not lost.
     start : array, shape (3,)
         Start pose given to the filter [m, m, rad].
     seed : int
@@ -647,7 +650,8 @@ def add_outliers(session: RouteSession, fraction: float, rng: np.random.Generato
 
 
 def skew_by_motion(clouds: Iterable[np.ndarray], true_increments: np.ndarray) -> list[np.ndarray]:
-    """Distort the points of each scan as the motion during the turn and the Doppler shift do without compensation.
+    """Distort the points of each scan as the motion during the turn and the Doppler shift do without
+    compensation.
 
     Parameters
     ----------

@@ -1,4 +1,5 @@
-"""Runs of the filters on the real route over many seeds, settings and wrong starts, as tables; hours of filtering.
+"""Runs of the filters on the real route over many seeds, settings and wrong starts, as tables;
+hours of filtering.
 
 A table is written row by row; a run that was stopped continues where it ended.
 """
@@ -56,7 +57,8 @@ SETTINGS = {
 FLAT = {"exponent": 1.0}
 TWICE = {"forward_m": 1.0, "left_m": 0.6, "yaw_rad": 2.0 * DEG}
 LASTING = {"persistent_fraction": 1.0, "life_scans": 40.0}
-# What could make the paper's errors larger: changes of the filter, of the points, and whether motion is compensated.
+# What could make the paper's errors larger: changes of the filter, of the points, and whether motion is
+# compensated.
 CAUSES = {
     "as in the tables": ({}, {}, True),
     "flat weights": (FLAT, {}, True),
@@ -114,7 +116,8 @@ def experiment_of(
 
 
 def front_end_of(fraction_1m: float, **changes: float) -> FrontEnd:
-    """Give the front end with a fraction of its points within 1 m, and `fraction_within_2m` of it within 2 m."""
+    """Give the front end with a fraction of its points within 1 m,
+    and `fraction_within_2m` of it within 2 m."""
     return FrontEnd(fraction_1m, fraction_within_2m(fraction_1m), **changes)
 
 
@@ -229,7 +232,8 @@ def measure_ingredients(real_root: str, number: str, without: str, seed: int) ->
 
 
 def measure_tuned(real_root: str, number: str, what: str, seed: int) -> list[dict]:
-    """Run the method `paper` over a whole session with the settings that were best on the first scans of session 02."""
+    """Run the method `paper` over a whole session with the settings that were best on the first scans of
+    session 02."""
     experiment = experiment_of(real_root, number)
     run = run_method(experiment, "paper", sample_session(experiment, seed), seed, **TUNED[what])
     return [{"what": what, **row_of(experiment, run, "tuned", seed)}]
@@ -258,7 +262,8 @@ def measure_outliers(real_root: str, number: str, share: float, seed: int) -> li
 def measure_rendered(
     real_root: str, number: str, first: int, n_scans: int, seed: int, *, weights: str
 ) -> list[dict]:
-    """Run both methods on points generated from the simulated radar, on a segment that the network was not trained on."""
+    """Run both methods on points generated from the simulated radar,
+    on a segment that the network was not trained on."""
     torch.set_num_threads(1)
     experiment = experiment_of(real_root, number, FrontEnd(0.80, 0.88))
     simulated = build_segment(real_root, number, first, n_scans, seed)
@@ -298,7 +303,8 @@ MEASURES = {
 
 
 def list_jobs(real_root: str) -> dict[str, list[tuple]]:
-    """List the jobs of each table; each ends with its seed. Wrong starts are drawn once, from sessions 02 and 07."""
+    """List the jobs of each table; each ends with its seed. Wrong starts are drawn once,
+    from sessions 02 and 07."""
     numbers, rng = list_sessions(real_root), np.random.default_rng(2020)
     ours = [number for number in ("01", *PAPER_SESSIONS) if number in numbers] or numbers
     driven = [number for number in ours if number != "01"] or ours
@@ -380,7 +386,8 @@ def run_table(
     Raises
     ------
     ValueError
-        If the table holds jobs that are not listed, such as those of another set of sessions; nothing is dropped.
+        If the table holds jobs that are not listed, such as those of another set of sessions; nothing is
+        dropped.
     """
     table = pd.read_csv(path, dtype=TEXT) if path.is_file() else pd.DataFrame({"job": []})
     wanted = [" ".join(map(str, key)) for key in jobs]
@@ -431,8 +438,8 @@ def load_runs(folder: Path | str) -> pd.DataFrame:
     Returns
     -------
     runs : pandas.DataFrame
-        One row per run: the columns of `row_of`, ``fraction_1m`` of the points, and ``odometry``, which is "rall"
-        for the authors' own.
+        One row per run: the columns of `row_of`, ``fraction_1m`` of the points, and ``odometry``, which is
+        "rall" for the authors' own.
     """
     own = {"seeds": {"fraction_1m": 0.40}, "quality": {}, "odometry": {}}
     tables = [load_table(folder, what).assign(**about) for what, about in own.items()]
@@ -454,8 +461,9 @@ def summarize_runs(runs: pd.DataFrame, by: list[str]) -> pd.DataFrame:
     Returns
     -------
     groups : pandas.DataFrame
-        Indexed by `by`: ``n_runs``, ``n_sessions`` and ``n_seeds``; means of ``rmse_m`` [m] with ``min_m`` and ``max_m``
-        over the runs, of ``rmse_yaw_deg`` [deg] and of the three classes [%]; ``failures`` per run.
+        Indexed by `by`: ``n_runs``, ``n_sessions`` and ``n_seeds``; means of ``rmse_m`` [m] with ``min_m``
+        and ``max_m`` over the runs, of ``rmse_yaw_deg`` [deg] and of the three classes [%]; ``failures`` per
+        run.
     """
     measures = {name: (name, "mean") for name in ("rmse_m", "rmse_yaw_deg", *CLASSES, "failures")}
     groups = runs.groupby(by).agg(

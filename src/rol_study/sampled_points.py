@@ -1,14 +1,16 @@
-"""Sample points from a lidar map at true poses, with the precision of a given front end: no radar, no network.
+"""Sample points from a lidar map at true poses, with the precision of a given front end: no radar,
+no network.
 
-The paper states two numbers of its front end, the fractions of its points within 1 m and 2 m of the lidar's (Sec. IV-B).
-Here every scan is a mixture of three kinds of points with these two fractions:
+The paper states two numbers of its front end, the fractions of its points within 1 m and 2 m of the lidar's
+(Sec. IV-B). Here every scan is a mixture of three kinds of points with these two fractions:
 
 - *near*: cells of the map that the radar could see from the true pose, with a small error;
 - *beside*: points between 1 m and 2 m off the map, as of walls that are generated too thick or twice;
-- *false*: anywhere within range. Some last one scan, some are static in the world for a while, some move with the car.
+- *false*: anywhere within range. Some last one scan, some are static in the world for a while, some move with
+the car.
 
-Maps are dense: about 30 % of the false points lie within 1 m of a map point and 47 % within 2 m on the real route.
-So at the paper's fractions no more than one point in six is true.
+Maps are dense: about 30 % of the false points lie within 1 m of a map point and 47 % within 2 m on the real
+route. So at the paper's fractions no more than one point in six is true.
 
 All clouds are in the radar frame, x forward, y left [m].
 """
@@ -42,8 +44,8 @@ class DenseMapError(SampledPointsError):
     chance_1m, chance_2m : float
         Fractions of points thrown at random that lie within 1 m and 2 m of the map.
     least_2m : float
-        Smallest fraction within 2 m that points with the fraction asked within 1 m can have; NaN where that is below
-        ``chance_1m``.
+        Smallest fraction within 2 m that points with the fraction asked within 1 m can have; NaN where that
+        is below ``chance_1m``.
     """
 
     def __init__(self, message: str, chance_1m: float, chance_2m: float, least_2m: float) -> None:
@@ -62,7 +64,8 @@ class FrontEnd:
     Attributes
     ----------
     fraction_1m, fraction_2m : float
-        Fractions of the points within 1 m and 2 m of a point of the map; 0.4 and 0.6 are the paper's (Sec. IV-B).
+        Fractions of the points within 1 m and 2 m of a point of the map; 0.4 and 0.6 are the paper's
+        (Sec. IV-B).
     n_points : int
         Points of a scan. The paper gives no number.
     near_m : float
@@ -110,9 +113,9 @@ def fraction_within_2m(fraction_1m: float) -> float:
     Returns
     -------
     fraction_2m : float
-        Rounded to two digits. Two thirds of the points beyond 1 m are beyond 2 m: with the paper's 40 % and 60 %
-        (Sec. IV-B), with the peaks of eleven real scans near the real map, 70 % and 80 %, and nearly with the points
-        that a network generates from these scans, 80 % and 85 %.
+        Rounded to two digits. Two thirds of the points beyond 1 m are beyond 2 m: with the paper's 40 % and
+        60 % (Sec. IV-B), with the peaks of eleven real scans near the real map, 70 % and 80 %, and nearly
+        with the points that a network generates from these scans, 80 % and 85 %.
     """
     return round(1.0 - BEYOND * (1.0 - fraction_1m), 2)
 
@@ -236,7 +239,8 @@ def solve_mixture(fractions: np.ndarray, fraction_1m: float, fraction_2m: float)
     Parameters
     ----------
     fractions : array, shape (2, 3)
-        Fraction of the points of each kind (columns: near, beside, false) within 1 m (first row) and 2 m of the map.
+        Fraction of the points of each kind (columns: near, beside, false) within 1 m (first row) and 2 m of
+        the map.
     fraction_1m, fraction_2m : float
         Fractions of the mixture.
 
@@ -248,7 +252,8 @@ def solve_mixture(fractions: np.ndarray, fraction_1m: float, fraction_2m: float)
     Raises
     ------
     DenseMapError
-        If points thrown at random lie near the map so often that a mixture would need fewer than none of the other kinds.
+        If points thrown at random lie near the map so often that a mixture would need fewer than none of the
+        other kinds.
     SampledPointsError
         If no mixture has these fractions for another reason.
     """
@@ -348,14 +353,15 @@ def sample_points(
     rng : numpy.random.Generator
         Source of randomness.
     mixture : array, shape (3,), optional
-        Weights of the three kinds, from `solve_mixture`; computed at these poses if not given. For a segment of a
-        trajectory pass those of the whole one: in a dense place, where false points lie near the map by chance,
-        the segment's own mixture would hold hardly a true point.
+        Weights of the three kinds, from `solve_mixture`; computed at these poses if not given. For a segment
+        of a trajectory pass those of the whole one: in a dense place, where false points lie near the map by
+        chance, the segment's own mixture would hold hardly a true point.
 
     Yields
     ------
     points : array, shape (k, 2)
-        Points in the radar frame [m], about ``n_points``; fewer where fewer cells are visible than near points are needed.
+        Points in the radar frame [m], about ``n_points``; fewer where fewer cells are visible than near
+        points are needed.
 
     Raises
     ------

@@ -1,4 +1,5 @@
-"""Training and evaluation of the networks in `data/weights`: sessions, pairs, training, threshold, weights and card.
+"""Training and evaluation of the networks in `data/weights`: sessions, pairs, training, threshold,
+weights and card.
 
 A recipe describes everything; every stage resumes where it stopped, and a finished stage is not repeated.
 """
@@ -121,7 +122,8 @@ def make_sessions(recipe: dict[str, Any], names: set[str], places: Places) -> No
 
 
 def choose_scans(root: Path, part: dict[str, Any], motion: str) -> tuple[Session, list[AlignedScan]]:
-    """Open a session, align its scans and select those of a set; scans of a stationary vehicle are left out."""
+    """Open a session, align its scans and select those of a set;
+    scans of a stationary vehicle are left out."""
     session = open_session(root / part["session"])
     odometry = load_radar_odometry(session.odometry_path)
     radar_us, mid_us, _ = compose_odometry(odometry)
@@ -154,7 +156,8 @@ def open_set(recipe: dict[str, Any], name: str, places: Places, stride: int = 1)
 
 
 def open_sets(recipe: dict[str, Any], networks: Sequence[dict[str, Any]], places: Places) -> dict[str, Any]:
-    """Make the sessions and open the held-out sets, every second pair for ablations, and the training sets of networks."""
+    """Make the sessions and open the held-out sets, every second pair for ablations,
+    and the training sets of networks."""
     held_out = {name for name in recipe["sets"] if not name.startswith("learn")}
     wanted = held_out | {network.get("learn", "learn") for network in networks}
     make_sessions(recipe, {part["session"] for name in wanted for part in recipe["sets"][name]}, places)
@@ -238,7 +241,8 @@ def choose_threshold(evaluated: pd.DataFrame, min_recall: float | None) -> int:
 def train_network(
     recipe: dict[str, Any], name: str, asked: dict[str, Any], pairs: Any, places: Places
 ) -> tuple[Generator, pd.DataFrame, dict[str, Any]]:
-    """Train one network of a recipe; return it with its history and the settings for the header of its file."""
+    """Train one network of a recipe; return it with its history and the settings for the header of its
+    file."""
     known = [{field.name for field in fields(kind)} for kind in (TrainConfig, TrainingExtensions)]
     own = {key: value for key, value in asked.items() if key not in NOT_TRAINING}
     if unknown := set(own) - known[0] - known[1]:
@@ -337,7 +341,8 @@ def compare_with_card(
 
 
 def run_networks(recipe: dict[str, Any], networks: dict[str, dict[str, Any]], places: Places) -> None:
-    """Train, evaluate and write networks; of ablations only the table is kept, and finished ones are not repeated."""
+    """Train, evaluate and write networks; of ablations only the table is kept,
+    and finished ones are not repeated."""
     variants = list_variants(recipe)
     sets, real = open_sets(recipe, list(networks.values()), places), open_real(places)
     for name, asked in networks.items():

@@ -1,7 +1,8 @@
 """Find faulty segments of a ground truth by comparing its increments with those of the odometry.
 
-A few published ground truths stand still or leap while the vehicle drives on. No estimate can follow them, so results are
-given with and without these scans. The rule compares ground truth and odometry only; it sees no estimate.
+A few published ground truths stand still or leap while the vehicle drives on. No estimate can follow them, so
+results are given with and without these scans. The rule compares ground truth and odometry only; it sees no
+estimate.
 """
 
 from __future__ import annotations
@@ -21,14 +22,16 @@ def find_faulty_steps(
 
     A step from one scan to the next is faulty if
 
-    - it differs in length from the odometry increment, corrected for scale, by more than ``n_sigmas`` times the robust
-      standard deviation of this difference over the moving vehicle (and more than ``MIN_LIMIT_M``), or by more than half of
-      that where the ground truth stands still, and
-    - the odometry increment differs by less than half of that from the median of its neighbours, so that it is not an
+    - it differs in length from the odometry increment, corrected for scale, by more than ``n_sigmas`` times
+    the robust
+      standard deviation of this difference over the moving vehicle (and more than ``MIN_LIMIT_M``), or by
+      more than half of that where the ground truth stands still, and
+    - the odometry increment differs by less than half of that from the median of its neighbours, so that it
+    is not an
       outlier of the odometry.
 
-    Scale and standard deviation are medians over the session itself, so neither a scale error of the odometry nor its noise
-    nor the faulty steps change the rule.
+    Scale and standard deviation are medians over the session itself, so neither a scale error of the odometry
+    nor its noise nor the faulty steps change the rule.
 
     Parameters
     ----------
@@ -37,8 +40,8 @@ def find_faulty_steps(
     increments : array, shape (n - 1, 3)
         Odometry increments between them [m, m, rad].
     n_sigmas : float
-        Limit in standard deviations. At 10, about 0.5 m, the CFEAR-3 odometry of sessions 01 and 02 contradicts the ground
-        truth at each marked step, too, by at least 0.4 m.
+        Limit in standard deviations. At 10, about 0.5 m, the CFEAR-3 odometry of sessions 01 and 02
+        contradicts the ground truth at each marked step, too, by at least 0.4 m.
     half_window : int
         Neighbours on each side.
 
@@ -69,10 +72,11 @@ def find_faulty_steps(
 
 
 def find_faulty_scans(truth: np.ndarray, increments: np.ndarray, *, max_gap: int = 8) -> np.ndarray:
-    """Mark the scans whose ground truth is faulty: those at a faulty step, and those shortly between two of them.
+    """Mark the scans whose ground truth is faulty: those at a faulty step,
+    and those shortly between two of them.
 
-    Between a segment in which the ground truth stands still and the leap that ends it, single steps may look right while the
-    poses are still wrong.
+    Between a segment in which the ground truth stands still and the leap that ends it, single steps may look
+    right while the poses are still wrong.
 
     Parameters
     ----------
@@ -93,7 +97,8 @@ def find_faulty_scans(truth: np.ndarray, increments: np.ndarray, *, max_gap: int
 
 
 def group_steps(steps: np.ndarray, max_gap: int = 8) -> list[tuple[int, int]]:
-    """Group steps with at most `max_gap` others between them, as pairs of the first and the last step of each group."""
+    """Group steps with at most `max_gap` others between them,
+    as pairs of the first and the last step of each group."""
     if not len(steps):
         return []
     parts = np.split(steps, np.flatnonzero(np.diff(steps) > max_gap + 1) + 1)

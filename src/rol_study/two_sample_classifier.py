@@ -1,7 +1,8 @@
 """Compare simulated with real scans by a two-sample classifier.
 
-A small convolutional network classifies patches of 16 azimuths x 64 range bins as real or simulated. It is evaluated
-on held-out scans. An area under the ROC curve of 0.5 means that the two cannot be separated, 1 that they always can.
+A small convolutional network classifies patches of 16 azimuths x 64 range bins as real or simulated. It is
+evaluated on held-out scans. An area under the ROC curve of 0.5 means that the two cannot be separated, 1 that
+they always can.
 """
 
 from __future__ import annotations

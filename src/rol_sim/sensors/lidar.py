@@ -1,4 +1,5 @@
-"""Simulate sweeps of an HDL-32E, one turn of 32 lasers while the car moves, in the units of Oxford's raw files.
+"""Simulate sweeps of an HDL-32E, one turn of 32 lasers while the car moves,
+in the units of Oxford's raw files.
 
 Radar frame: x forward, y left, z up, level, above the ground by the mast's height. The lidar's place in it
 is its extrinsic calibration. Angles run clockwise seen from above, 0 to the lidar's left, elevations
@@ -22,14 +23,16 @@ FIRINGS_PER_PACKET = 12
 TURN_US = 50_000.0
 PACKET_RAD = 2.0 * np.pi * FIRINGS_PER_PACKET * FIRING_US / TURN_US  # turned during one packet
 SEAM_RAD = np.pi  # a sweep begins with the first packet past this angle, to the lidar's right
-# How many of the 32 lasers, from the top, see past the own car, per 10 deg of angle, left lidar; below is the roof,
-# at 0 to 40 deg stand the mast of the radar and the other lidar. Constants of Oxford's car, measured on 257 real sweeps.
+# How many of the 32 lasers, from the top, see past the own car, per 10 deg of angle, left lidar; below is the
+# roof, at 0 to 40 deg stand the mast of the radar and the other lidar. Constants of Oxford's car, measured on
+# 257 real sweeps.
 CLEAR_LASERS = np.array(
     [0, 0, 0, 0, 18, 17, 17, 18, 19, 23, 27, 26, 25, 28, 31, 32, 32, 32]
     + [32, 32, 32, 32, 32, 32, 32, 31, 27, 26, 26, 25, 22, 21, 21, 20, 19, 19]
 )
 
-# Material -> fraction of light sent back by a head-on surface, fraction of rays lost without a trace, softness [m].
+# Material -> fraction of light sent back by a head-on surface, fraction of rays lost without a trace,
+# softness [m].
 SURFACES = {
     "GROUND": (0.12, 0.01, 0.0),
     "PAVEMENT": (0.22, 0.01, 0.0),
@@ -124,7 +127,8 @@ def schedule_firings(
     turn_us : float
         Duration of the turn [us].
     past_seam : float
-        How far past `SEAM_RAD` the first packet begins [rad]. The sweep ends with the packet that reaches it again.
+        How far past `SEAM_RAD` the first packet begins [rad]. The sweep ends with the packet that reaches it
+        again.
 
     Returns
     -------
@@ -256,7 +260,8 @@ def hide_behind_car(sweep: Sweep, sensor: str) -> Sweep:
     Returns
     -------
     sweep : Sweep
-        The turn with 0 in place of the returns below `CLEAR_LASERS`. Returns from the car itself are left out.
+        The turn with 0 in place of the returns below `CLEAR_LASERS`. Returns from the car itself are left
+        out.
 
     Raises
     ------

@@ -1,4 +1,5 @@
-"""Convert point echoes to the bytes of a CTS350-X scan: point spread, speckle, noise, streaks, leakage, codes.
+"""Convert point echoes to the bytes of a CTS350-X scan: point spread, speckle, noise, streaks, leakage,
+codes.
 
 All constants here were measured on real scans. Columns are range bins, rows azimuths in the order of the
 turn. The field is complex: echoes add with their phases, so speckle and its correlation come out by
@@ -21,8 +22,8 @@ NOISE_STEP = 5  # the noise is limited to 1/5.9 of the band, so every fifth bin 
 NOISE_RANGES_M = np.array([0.0, 3.0, 6.0, 28.0, 41.0, 80.0, 106.0, 145.0, 165.0])
 # Mean noise power at these ranges, from the fraction of code 0 in quiet bins.
 NOISE_POWERS = np.array([0.7, 0.75, 1.55, 2.25, 2.35, 2.1, 1.85, 1.55, 1.5])
-# The integer power is floor(power + 0.72): with exponential noise this fits the fractions of codes 0, 6, 9, 12,
-# ...
+# The integer power is floor(power + 0.72): with exponential noise this fits the fractions of codes 0, 6, 9,
+# 12, ...
 ROUNDING = 0.72
 
 # Two-way antenna pattern in azimuth, in rows of 0.9 deg.
@@ -325,7 +326,8 @@ def _interpolate_peak(field, row, peak, amplitude):  # pragma: no cover (compile
 
 @compiled
 def _harmonic_amplitude(order, amplitude, gain, half_angle):  # pragma: no cover (compiled)
-    """Amplitude of a harmonic: square law for the second, Fourier series of a clipped sine for the odd ones."""
+    """Amplitude of a harmonic: square law for the second,
+    Fourier series of a clipped sine for the odd ones."""
     if order == 2:
         return SECOND_HARMONIC * (gain * amplitude) ** 2
     below = np.sin((order - 1) * half_angle) / (order - 1)

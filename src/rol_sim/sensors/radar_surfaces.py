@@ -274,8 +274,8 @@ def _step_aside(heading, total, dx, dy):  # pragma: no cover (compiled)
 def _answer(surface, cosine, number, cell, z):  # pragma: no cover (compiled)
     """Backscatter of one cell of the world, as a fraction of a perfect scatterer's.
 
-    A cell has a strength of its own, times one that changes every few degrees of incidence: seen from ten metres on, a
-    wall glints elsewhere.
+    A cell has a strength of its own, times one that changes every few degrees of incidence: seen from ten
+    metres on, a wall glints elsewhere.
     """
     aspect = int(np.arccos(min(cosine, 1.0)) / ASPECT)
     diffuse = (

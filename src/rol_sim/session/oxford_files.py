@@ -1,7 +1,8 @@
 """Write the files of an Oxford Radar RobotCar session, such that `rol.oxford` reads them back.
 
-Every writer refuses with an `OxfordError` what its reader would refuse; the message names the file and the fault.
-Poses and points are in the project's frames (x forward, y left, z up) and are turned into Oxford's here.
+Every writer refuses with an `OxfordError` what its reader would refuse; the message names the file and the
+fault. Poses and points are in the project's frames (x forward, y left, z up) and are turned into Oxford's
+here.
 """
 
 from __future__ import annotations
@@ -69,7 +70,8 @@ def save_radar(path: Path | str, scan: RadarScan) -> None:
 
 
 def save_velodyne_raw(path: Path | str, raw: VelodyneRaw) -> None:
-    """Write one raw sweep as `rol.oxford.load_velodyne_raw` returns it, bit for bit; an OxfordError if not."""
+    """Write one raw sweep as `rol.oxford.load_velodyne_raw` returns it, bit for bit;
+    an OxfordError if not."""
     n = np.size(raw.stamps_us)
     if n == 0:
         raise OxfordError(f"{path}: sweep without a firing")
@@ -84,7 +86,8 @@ def save_velodyne_raw(path: Path | str, raw: VelodyneRaw) -> None:
 
 
 def save_velodyne_binary(path: Path | str, points: np.ndarray) -> None:
-    """Write points (n, 4), float32, for `rol.oxford.load_velodyne_binary`; an OxfordError if it refuses them."""
+    """Write points (n, 4), float32, for `rol.oxford.load_velodyne_binary`;
+    an OxfordError if it refuses them."""
     points = np.asarray(points, dtype="<f4")
     if points.ndim != 2 or points.shape[1] != 4 or len(points) == 0:
         raise OxfordError(f"{path}: expected points of shape (n, 4) with n > 0, got {points.shape}")

@@ -131,7 +131,8 @@ class SimulationSettings:
     real_root : str
         World "route" only: folder of the real data; may be empty, see `rol_data.rall.find_real_root`.
     unmapped_share : float
-        World "route" only: things that the map does not show, as a fraction of the groups of cells that it shows.
+        World "route" only: things that the map does not show, as a fraction of the groups of cells that it
+        shows.
     lidar, radar : dict
         Settings of `LidarSettings` and `RadarSettings` other than the usual ones.
 

@@ -251,8 +251,8 @@ def _find_route(
 def build_twins(real_root: Path | str, seed: int = 1, margin_s: float = 30.0) -> SimulatedSession:
     """Prepare simulated twins of the real scans whose poses on the real map are known.
 
-    The world is that of the route; the car drives through the poses of the scans, before and after them it goes on
-    as it went.
+    The world is that of the route; the car drives through the poses of the scans, before and after them it
+    goes on as it went.
 
     Parameters
     ----------

@@ -11,7 +11,8 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 # Corners of the loop and the streets that leave it, before the plan is stretched, bent, mirrored and turned.
-# Eight corners with turns of 20 to 80 degrees. Side streets: (corner or place between two, direction, length).
+# Eight corners with turns of 20 to 80 degrees. Side streets: (corner or place between two, direction,
+# length).
 _CORNERS = np.array(
     [
         [0.0, 0.0],

@@ -1,7 +1,7 @@
 """The town: streets, houses, gardens and the land, drawn once; and what differs from one session to the next.
 
-`build_town` draws what stays. `add_session_objects` adds what a session finds: parked vehicles, the leaves of its season,
-cut hedges, changed street furniture. Both are determined by the generator they are given.
+`build_town` draws what stays. `add_session_objects` adds what a session finds: parked vehicles, the leaves of
+its season, cut hedges, changed street furniture. Both are determined by the generator they are given.
 """
 
 from __future__ import annotations

@@ -1,6 +1,7 @@
 """Bodies that come and go: cars, vans, buses, bicycles, people, and the furniture of the street.
 
-Frames as in `rol_sim.world.shapes`: origin on the ground in the middle of the body, x forward, y left, z up, metres.
+Frames as in `rol_sim.world.shapes`: origin on the ground in the middle of the body, x forward, y left, z up,
+metres.
 """
 
 from __future__ import annotations
