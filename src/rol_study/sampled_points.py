@@ -1,5 +1,4 @@
-"""Sample points from a lidar map at true poses, with the precision of a given front end: no radar,
-no network.
+"""Sample points from a lidar map at true poses, with the precision of a given front end.
 
 The paper states two numbers of its front end, the fractions of its points within 1 m and 2 m of the lidar's
 (Sec. IV-B). Here every scan is a mixture of three kinds of points with these two fractions:
@@ -7,7 +6,7 @@ The paper states two numbers of its front end, the fractions of its points withi
 - *near*: cells of the map that the radar could see from the true pose, with a small error;
 - *beside*: points between 1 m and 2 m off the map, as of walls that are generated too thick or twice;
 - *false*: anywhere within range. Some last one scan, some are static in the world for a while, some move with
-the car.
+  the car.
 
 Maps are dense: about 30 % of the false points lie within 1 m of a map point and 47 % within 2 m on the real
 route. So at the paper's fractions no more than one point in six is true.
