@@ -59,7 +59,7 @@ def draw_scan_on_map(
     figure : Figure
     """
     points, radar_image, generated = result
-    figure, axes = plt.subplots(1, 3, figsize=(9.6, 3.5), dpi=100)
+    figure, axes = plt.subplots(1, 3, figsize=(9.6, 3.5), dpi=90)
     plots.show_image(axes[0], clean(radar_image), vmax=90, title=titles[0])
     plots.show_image(axes[1], generated, title=titles[1])
     around = crop(map_points, pose, 1.3 * half)
@@ -161,7 +161,7 @@ def draw_scans_as_in_paper(
     """
     edges = np.arange(0.0, 10.01, 0.25)
     size, widths = (9.6, 2.3 * len(results)), (1, 1, 1, 1.15)
-    figure, axes = plt.subplots(len(results), 4, figsize=size, width_ratios=widths, dpi=80, squeeze=False)
+    figure, axes = plt.subplots(len(results), 4, figsize=size, width_ratios=widths, dpi=72, squeeze=False)
     images = [[clean(radar_image), generated] for _, radar_image, generated in results]
     plots.draw_image_grid(axes[:, :2], images, ("real radar", "generated"), labels, half=50.0, vmax=(70, 255))
     for row, (points, _, _), pose in zip(axes, results, poses, strict=True):
@@ -210,7 +210,7 @@ def draw_points_on_scans(
     -------
     figure : Figure
     """
-    figure, axes = plt.subplots(1, len(images), figsize=(9.6, 0.4 + 9.6 / len(images)), dpi=90)
+    figure, axes = plt.subplots(1, len(images), figsize=(9.6, 0.4 + 9.6 / len(images)), dpi=75)
     names = {"real": "lidar", "fake": "generated"}
     for ax, image, layer, title in zip(axes, images, layers, titles, strict=True):
         plots.show_image(ax, clean(image), vmax=vmax)
