@@ -59,7 +59,7 @@ def draw_scan_on_map(
     figure : Figure
     """
     points, radar_image, generated = result
-    figure, axes = plt.subplots(1, 3, figsize=(9.6, 3.5), dpi=100)
+    figure, axes = plt.subplots(1, 3, figsize=(9.6, 3.5), dpi=90)
     plots.show_image(axes[0], clean(radar_image), vmax=90, title=titles[0])
     plots.show_image(axes[1], generated, title=titles[1])
     around = crop(map_points, pose, 1.3 * half)
@@ -161,7 +161,7 @@ def draw_scans_as_in_paper(
     """
     edges = np.arange(0.0, 10.01, 0.25)
     size, widths = (9.6, 2.3 * len(results)), (1, 1, 1, 1.15)
-    figure, axes = plt.subplots(len(results), 4, figsize=size, width_ratios=widths, dpi=80, squeeze=False)
+    figure, axes = plt.subplots(len(results), 4, figsize=size, width_ratios=widths, dpi=72, squeeze=False)
     images = [[clean(radar_image), generated] for _, radar_image, generated in results]
     plots.draw_image_grid(axes[:, :2], images, ("real radar", "generated"), labels, half=50.0, vmax=(70, 255))
     for row, (points, _, _), pose in zip(axes, results, poses, strict=True):
@@ -210,7 +210,7 @@ def draw_points_on_scans(
     -------
     figure : Figure
     """
-    figure, axes = plt.subplots(1, len(images), figsize=(9.6, 0.4 + 9.6 / len(images)), dpi=90)
+    figure, axes = plt.subplots(1, len(images), figsize=(9.6, 0.4 + 9.6 / len(images)), dpi=75)
     names = {"real": "lidar", "fake": "generated"}
     for ax, image, layer, title in zip(axes, images, layers, titles, strict=True):
         plots.show_image(ax, clean(image), vmax=vmax)
@@ -279,7 +279,7 @@ def draw_localization(
     """
     middle = truth[:, :2].mean(axis=0)
     half = max(20.0, 0.6 * np.ptp(truth[:, :2], axis=0).max() + 8.0)
-    figure = plt.figure(figsize=(9.6, 4.2))
+    figure = plt.figure(figsize=(9.6, 4.2), dpi=90)
     left, right = figure.subfigures(1, 2, width_ratios=(1, 1.15))
     ax = left.subplots()
     plots.show_points(ax, crop(map_points, middle, half + 2.0), colour=COLOURS["map"], size=1.5)
@@ -330,7 +330,7 @@ def draw_submap(
     -------
     figure : Figure
     """
-    figure, (ax, other, last) = plt.subplots(1, 3, figsize=(9.6, 3.9), dpi=100, width_ratios=(1, 1, 0.8))
+    figure, (ax, other, last) = plt.subplots(1, 3, figsize=(9.6, 3.9), dpi=85, width_ratios=(1, 1, 0.8))
     middle = path[:, :2].mean(axis=0)
     size = np.ptp(path[:, :2], axis=0).max() / 2.0 + 30.0
     plots.show_points(ax, crop(map_points, middle, size), colour=COLOURS["map"], size=1.5, label="map")
@@ -372,7 +372,7 @@ def draw_lidar_and_map(
     figure : Figure
     """
     width = 9.6 / len(clouds)
-    figure, axes = plt.subplots(1, len(clouds), figsize=(9.6, width + 0.4), dpi=100)
+    figure, axes = plt.subplots(1, len(clouds), figsize=(9.6, width + 0.4), dpi=75)
     for ax, (reference, points, colour), title in zip(axes, clouds, titles, strict=True):
         plots.show_points(ax, crop(reference, np.zeros(2), 1.2 * half), colour=COLOURS["map"], size=0.6)
         plots.show_points(ax, points, colour=COLOURS[colour], size=3.0, title=title)
