@@ -52,7 +52,7 @@ def draw_scan_on_map(
     half : float
         Half the edge of the square shown [m].
     arrow : str
-        Colour of the pose, a name of `rol_book.plots.COLOURS`.
+        Colour of the pose, a name of ``rol_book.plots.COLOURS``.
 
     Returns
     -------

@@ -44,7 +44,7 @@ class RouteSession:
     increments : array, shape (n - 1, 3)
         Radar odometry: pose of each scan in the one before [m, m, rad].
     place : str
-        One of `rol_data.rall.PLACES`.
+        One of ``rol_data.rall.PLACES``.
     odometry : str
         Where the increments come from, one of `ODOMETRIES`.
     is_faulty : array of bool, shape (n,), optional
@@ -85,7 +85,7 @@ def list_sessions(real_root: Path | str, place: str = "oxford", odometry: str = 
     real_root : path
         Folder of the real data, see `rol_data.rall.find_real_root`.
     place : str
-        One of `rol_data.rall.PLACES`.
+        One of ``rol_data.rall.PLACES``.
     odometry : str
         One of `ODOMETRIES`.
 
@@ -172,7 +172,7 @@ def load_session(
     map_points : array, shape (m, 2)
         The map, from `rol_data.rall.load_map` [m].
     place : str
-        One of `rol_data.rall.PLACES`.
+        One of ``rol_data.rall.PLACES``.
     odometry : str
         One of `ODOMETRIES`.
 
