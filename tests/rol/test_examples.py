@@ -284,7 +284,7 @@ def test_entries_for_citing_are_those_of_the_bibliography() -> None:
         r"^@.*?^}$", (ROOT / "book" / "cite.md").read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL
     )
     [book] = [entry for entry in entries if entry not in known]
-    assert len(entries) == 6
+    assert len(entries) == 7
     version = re.search(r'__version__ = "(.*)"', (PACKAGE / "__init__.py").read_text(encoding="utf-8"))[1]
     citation = yaml.safe_load((ROOT / "CITATION.cff").read_text(encoding="utf-8"))
     assert citation["version"] == version and f"Version {version}" in book
