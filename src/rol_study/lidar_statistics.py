@@ -28,8 +28,8 @@ from rol.oxford import (
 )
 from rol.pairs import usable_sweeps
 from rol_study.radar_statistics import hellinger_distance
+from rol_study.real_submap import SWEEPS_PATH
 
-SWEEPS_PATH = Path("oxford_car_visualiser2/data")  # the real sweeps, below the folder of the real data
 SENSOR = "velodyne_left"
 REAL, HALVES = "real: one street", ("its first half", "its second half")
 AZIMUTH_CELLS = 72  # of 5 deg

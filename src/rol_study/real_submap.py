@@ -1,9 +1,8 @@
-"""A submap of real lidar sweeps: placed along the official odometry, accumulated,
-and registered onto the published map.
+"""A submap of real lidar sweeps, placed along the official odometry and registered onto the published map.
 
 The sweeps are those of the left HDL-32E around the eleven real radar scans of `rol_data.rall.load_scans`. A
-`.bin` holds the points in the order in which they were fired, but neither their times nor the meaning of the
-sweep's stamp, so the position of the stamp within the sweep is an argument.
+`.bin` holds no times; those of the points follow from their bearings. The stamp is the beginning of a sweep, as
+`rol_study.real_pairs` finds.
 """
 
 from __future__ import annotations
@@ -31,15 +30,15 @@ from rol.oxford import (
 )
 from rol.radar import deskew_points
 from rol_beyond.augmentation import rotate_points
+from rol_data.oxford_pairs import SWEEP_SECONDS, firing_fractions
 from rol_data.rall import SCANS_PATH
 
 SWEEPS_PATH = Path("oxford_car_visualiser2/data")  # below the folder of the real data
 SENSOR = "velodyne_left"
-SWEEP_SECONDS = 0.05  # one turn of the HDL-32E
 MIN_HITS = 20  # sweeps that must hit a cell: those of one second, longer than a moving vehicle covers it
 # Stages of `rol.maps.register_maps` for a segment near its place.
 SEGMENT_STAGES = ((np.inf, 2.0, 0.5, 0.25), (np.inf, 1.0, 0.3, 0.25))
-STAMP_POSITION = 0.5  # of a sweep's stamp within its turn: 0 the beginning, 1 the end
+STAMP_POSITION = 0.0  # of a sweep's stamp within its turn: 0 the beginning, 1 the end
 
 
 class SubmapError(ValueError):
@@ -142,7 +141,7 @@ def load_cloud(
         If the file is missing or at fault.
     """
     points = load_velodyne_binary(path)
-    seconds = (np.arange(len(points)) / len(points) - stamp_position) * SWEEP_SECONDS
+    seconds = (firing_fractions(points) - stamp_position) * SWEEP_SECONDS
     points = sweep_to_radar(points, relate_sensors(EXTRINSICS["radar"], EXTRINSICS[SENSOR]))[:, :3]
     points = deskew_points(points, seconds, twist)
     return crop_range(remove_ground(points, min_height), max_range)[:, :2]

@@ -23,12 +23,10 @@ def find_faulty_steps(
     A step from one scan to the next is faulty if
 
     - it differs in length from the odometry increment, corrected for scale, by more than ``n_sigmas`` times
-    the robust
-      standard deviation of this difference over the moving vehicle (and more than ``MIN_LIMIT_M``), or by
-      more than half of that where the ground truth stands still, and
+      the robust standard deviation of this difference over the moving vehicle (and more than
+      ``MIN_LIMIT_M``), or by more than half of that where the ground truth stands still, and
     - the odometry increment differs by less than half of that from the median of its neighbours, so that it
-    is not an
-      outlier of the odometry.
+      is not an outlier of the odometry.
 
     Scale and standard deviation are medians over the session itself, so neither a scale error of the odometry
     nor its noise nor the faulty steps change the rule.

@@ -33,14 +33,18 @@ def write_odometry(root: Path, n: int = 9) -> None:
 
 
 def write_sweep(path: Path, stamp_us: int) -> None:
-    """A sweep of `PLACES`, and of the ground, by a radar that moves with TWIST; the stamp is the middle."""
-    seconds = (stamp_us - FIRST_US) / 1e6 + (np.arange(400) / 400 - 0.5) * 0.05
-    poses = exp(TWIST, seconds)
-    local = np.stack(
-        [relative_pose(p, np.array([x, y, 0.0])) for p, (x, y, _) in zip(poses, PLACES, strict=True)]
-    )
-    local[:, 2] = np.where(np.arange(400) % 4 == 0, -2.0, 0.5)  # each fourth point is on the ground
-    points = transform_points_3d(T_LIDAR_RADAR, local) * (1, -1, -1)
+    """A sweep of `PLACES`, and of the ground, by a radar that moves with TWIST, from the first place clockwise."""
+    fractions = np.zeros(400)
+    for _ in range(5):  # when a point is fired depends on its bearing, and the bearing on when
+        poses = exp(TWIST, (stamp_us - FIRST_US) / 1e6 + 0.05 * fractions)
+        local = np.stack(
+            [relative_pose(p, np.array([x, y, 0.0])) for p, (x, y, _) in zip(poses, PLACES, strict=True)]
+        )
+        local[:, 2] = np.where(np.arange(400) % 4 == 0, -2.0, 0.5)  # each fourth point is on the ground
+        points = transform_points_3d(T_LIDAR_RADAR, local)
+        clockwise = -np.arctan2(points[:, 1], points[:, 0])
+        fractions = np.mod(clockwise - clockwise[0], 2.0 * np.pi) / (2.0 * np.pi)
+    points = points[np.argsort(fractions)] * (1, -1, -1)
     rows = np.vstack([points.T, np.full(400, 7.0)]).astype("<f4")
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_bytes(rows.tobytes())
@@ -76,7 +80,7 @@ def test_sweeps_lie_where_they_were_recorded(root: Path) -> None:
 
 
 def test_the_position_of_the_stamp_matters(root: Path) -> None:
-    submap = real_submap.build_submap(real_submap.load_placed_sweeps(root, stamp_position=0.0), min_hits=3)
+    submap = real_submap.build_submap(real_submap.load_placed_sweeps(root, stamp_position=0.5), min_hits=3)
     assert 0.1 < np.median(distances_to_places(submap)) < 0.3  # half a sweep at 8 m/s
 
 
