@@ -1,8 +1,8 @@
 """A submap of real lidar sweeps, placed along the official odometry and registered onto the published map.
 
 The sweeps are those of the left HDL-32E around the eleven real radar scans of `rol_data.rall.load_scans`. A
-`.bin` holds no times; those of the points follow from their bearings. The stamp is the beginning of a sweep, as
-`rol_study.real_pairs` finds.
+`.bin` holds no times; those of the points follow from their bearings. A stamp is the beginning of a sweep,
+as `rol_study.real_pairs` finds.
 """
 
 from __future__ import annotations
