@@ -472,11 +472,11 @@ class RecoveringFilter(ParticleFilter):
     ) -> None:
         self.map_points, self.recovery = map_points, recovery
         self.coarse_grid: MapGrid | None = None
-        low, high = map_points.min(axis=0), map_points.max(axis=0)
-        self.bounds = low - recovery.max_outside_m, high + recovery.max_outside_m
         exponent = recovery.stationary_weight * settings.measurement.exponent
         self.stationary = replace(settings, measurement=replace(settings.measurement, exponent=exponent))
         grid = settings.measurement.build_grid(map_points) if grid is None else grid
+        low, high = map_points.min(axis=0), map_points.max(axis=0)
+        self.bounds = low - recovery.max_outside_m, high + recovery.max_outside_m
         super().__init__(grid, start, settings, rng)
         self.is_far = not is_start_known
 

@@ -174,11 +174,31 @@ def load_cloud(path: Path | str) -> np.ndarray:
     path = Path(path)
     if not path.is_file():
         raise MulranError(f"{path}: missing")
+    if not _is_whole(path.read_bytes()):  # Open3D would fill up what is missing
+        raise MulranError(f"{path}: truncated, or no cloud")
     with open3d.utility.VerbosityContextManager(open3d.utility.VerbosityLevel.Error):
         points = np.asarray(open3d.io.read_point_cloud(str(path), format="pcd").points)
     if len(points) == 0 or not np.isfinite(points).all():
-        raise MulranError(f"{path}: truncated, or holds no finite points")
+        raise MulranError(f"{path}: holds no points, or not finite ones")
     return points
+
+
+def _is_whole(content: bytes) -> bool:
+    """Check whether a .pcd holds as many points as its header states."""
+    head, _, rest = content.partition(b"\nDATA ")
+    kind, _, body = rest.partition(b"\n")
+    stated = {name: values for name, *values in map(bytes.split, head.splitlines()) if values}
+    try:
+        (n,) = map(int, stated[b"POINTS"])
+        counts = stated.get(b"COUNT", [b"1"] * len(stated[b"SIZE"]))
+        size = sum(int(a) * int(b) for a, b in zip(stated[b"SIZE"], counts, strict=True))
+    except (KeyError, ValueError):
+        return False
+    if kind.strip() == b"ascii":
+        return len(body.splitlines()) >= n
+    if kind.strip() == b"binary_compressed":
+        return len(body) >= 8 + int.from_bytes(body[:4], "little")
+    return len(body) >= n * size
 
 
 def radar_from_lidar() -> np.ndarray:

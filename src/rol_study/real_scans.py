@@ -13,7 +13,7 @@ import pandas as pd
 from scipy.spatial import cKDTree
 
 from rol.bev import image_to_points
-from rol.geometry import compose, relative_pose
+from rol.geometry import check_fields, compose, relative_pose
 from rol.lidar import crop_range, remove_ground
 from rol.mcl import MclSettings
 from rol.pairs import PairSettings
@@ -273,11 +273,19 @@ class LocalizerSettings:
         Of detection and relocalization.
     density_radius_m : float
         As in `rol_beyond.pipeline.RobustLocalizer`.
+
+    Raises
+    ------
+    ValueError
+        If a value is out of its range; the message names it.
     """
 
     filter: MclSettings
     recovery: RecoverySettings
     density_radius_m: float
+
+    def __post_init__(self) -> None:
+        check_fields(self, {"[0, inf)": "density_radius_m"})
 
 
 def wrong_starts(off_m: float, off_deg: float, n_directions: int) -> np.ndarray:

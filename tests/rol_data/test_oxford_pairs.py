@@ -111,7 +111,8 @@ def test_file_that_is_not_listed_and_listed_sweep_without_file_are_left_out_and_
 
 def test_sweep_flagged_0_is_left_out(tree: Path) -> None:
     path = tree / "two/data/velodyne_left.timestamps"
-    path.write_text(path.read_text().replace(f"{START + 60_000} 1", f"{START + 60_000} 0"))
+    listed = path.read_text(encoding="utf-8").replace(f"{START + 60_000} 1", f"{START + 60_000} 0")
+    path.write_text(listed, encoding="utf-8")
     assert stamps_of(find_pairs(tree)) == [10_000, 110_000, 160_000, 210_000, 260_000]
 
 
@@ -155,8 +156,8 @@ def test_odometry_beside_the_scans_gives_the_velocity(tree: Path) -> None:
     scan = find_pairs(tree).scans[1]
     assert scan.twist == pytest.approx((8.0, 0.0, 0.0)) and scan.odometry_path == path
     np.testing.assert_allclose(scan.pose, [4.0, 0.0, 0.0])
-    lines = path.read_text().splitlines(keepends=True)
-    path.write_text("".join(lines[:2] + lines[3:]))  # a gap
+    lines = path.read_text(encoding="utf-8").splitlines(keepends=True)
+    path.write_text("".join(lines[:2] + lines[3:]), encoding="utf-8")  # a gap
     pairs = find_pairs(tree)
     assert pairs.scans[1].twist is None
     assert "gap before line 3" in pairs.faults[0] and str(path) in pairs.faults[0]

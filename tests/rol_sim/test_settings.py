@@ -33,6 +33,11 @@ from rol_study.sampled_points import FrontEnd, SampledPointsError
 NEEDED = {
     "AdaptationConfig": {"reach_m": 20.0},
     "RecoverySettings": {"reference_contrast": 0.2},
+    "LocalizerSettings": {
+        "filter": MclSettings(),
+        "recovery": RecoverySettings(reference_contrast=0.2),
+        "density_radius_m": 1.0,
+    },
     "SearchSettings": {"reach_m": 30.0},
     "Surface": {"diffuse": 0.1},
     "SessionSettings": {"start": "2019-01-10T11:46:21"},
@@ -98,7 +103,7 @@ def test_every_part_of_any_settings_is_of_its_class(kind: type) -> None:
 def test_the_classes_with_parts_are_all_there() -> None:
     names = {kind.__name__ for kind in settings_classes(parts)}
     assert names == {
-        "KldResampling", "LocalMapSettings", "MclSettings", "PairSettings", "RecoverySettings", "ScanToMapSettings",
+        "KldResampling", "LocalMapSettings", "LocalizerSettings", "MclSettings", "PairSettings", "RecoverySettings", "ScanToMapSettings",
         "SessionSettings", "SimulationSettings",
     }  # fmt: skip
 
@@ -129,7 +134,7 @@ def test_the_classes_are_all_there() -> None:
     names = {kind.__name__ for kind in settings_classes(has_numbers)}
     assert names == {
         "AdaptationConfig", "ConfirmationSettings", "DetectionSettings", "FailureRule", "FrontEnd", "IcpSettings", "KldResampling",
-        "LidarSettings", "LikelihoodField", "MapSettings", "MclSettings", "Measurement", "MotionModel", "MotionNoise", "PairSettings",
+        "LidarSettings", "LikelihoodField", "LocalizerSettings", "MapSettings", "MclSettings", "Measurement", "MotionModel", "MotionNoise", "PairSettings",
         "PlausibilitySettings", "RadarSettings", "RecoverySettings", "RelocalizationSettings", "Resampling",
         "RobustIcpSettings", "ScanToMapSettings", "SearchSettings", "SessionSettings", "SimulationSettings", "Surface",
         "TrainConfig",
