@@ -125,19 +125,12 @@ def all_runs(config: dict) -> list[Run]:
     return runs
 
 
-def book_pages(config: dict) -> dict[str, Run]:
-    """Give the runs that the book shows, by page name.
-
-    A chapter that runs for every session is shown for the training session; the localization is shown for all.
-    """
-    pages = {}
+def book_pages(config: dict) -> list[Run]:
+    """List the runs that the book shows, one for each chapter: that of the first session and method which it has."""
+    first: dict[str, Run] = {}
     for run in all_runs(config):
-        if CHAPTERS[run.chapter] == "method":
-            more = [run.session] + ([run.method] if len(config["methods"]) > 1 else [])
-            pages["-".join([run.chapter, *more])] = run
-        elif run.session in ("", config["sessions"][0]):
-            pages[run.chapter] = run
-    return pages
+        first.setdefault(run.chapter, run)
+    return list(first.values())
 
 
 # ---- parameters -----------------------------------------------------------------------------------------------

@@ -9,7 +9,6 @@ from __future__ import annotations
 import base64
 import datetime
 import os
-import re
 import shutil
 import subprocess
 import sys
@@ -22,7 +21,7 @@ import yaml
 
 import chapters
 import check
-from chapters import CHAPTERS, NOTEBOOKS, ROOT, ChapterError, Run, tagged_cells
+from chapters import NOTEBOOKS, ROOT, ChapterError, tagged_cells
 from rol.files import read_text, write_text
 from toolbox_pages import stage_toolbox
 
@@ -49,42 +48,23 @@ def first_text(notebook: nbformat.NotebookNode) -> nbformat.NotebookNode:
     return next(cell for cell in notebook.cells if cell.cell_type == "markdown")
 
 
-def fold_parameters(notebook: nbformat.NotebookNode) -> None:
-    """Hide the parameters, and those that papermill put in, behind lines that say what they are (in place)."""
-    for tag, words in (("parameters", "parameters"), ("injected-parameters", "parameters of this run")):
+def name_folded_cells(notebook: nbformat.NotebookNode) -> None:
+    """Hide the parameters, and label each hidden cell by what it holds: parameters, setup, or plot code (in place)."""
+    for tag in ("parameters", "injected-parameters"):
         for cell in tagged_cells(notebook, tag):
             cell.metadata["tags"] = [tag, "hide-input"]
-            show, hide = (f"{do} the {words}" for do in ("Show", "Hide"))
-            cell.metadata["mystnb"] = {"code_prompt_show": show, "code_prompt_hide": hide}
-
-
-def open_with_picture(notebook: nbformat.NotebookNode, images: Path, page: str, kind: str) -> None:
-    """Put a picture of the chapter below its first words, with one sentence on what it shows (in place).
-
-    It is the last figure that has a sentence in its cell's metadata (`opening`) and that the run drew; without the
-    real data some chapters have none.
-    """
-    for cell in reversed(notebook.cells):
-        png = png_of(cell) if "opening" in cell.metadata else None
-        if png is None:
-            continue
-        images.mkdir(exist_ok=True)
-        (images / f"opening-{page}.png").write_bytes(png)
-        words = cell.metadata["opening"].replace("{kind}", kind.lower())
-        label, alt = cell.metadata["mystnb"]["figure"]["name"], cell.metadata["mystnb"]["image"]["alt"]
-        first_text(notebook).source += (
-            f"\n\n```{{image}} ../images/opening-{page}.png\n:alt: {alt}\n:class: opening\n```\n\n"
-            f"```{{container}} opening\n{words} ({{numref}}`{label}`).\n```"
-        )
-        return
-
-
-def number_title(notebook: nbformat.NotebookNode, page: str) -> None:
-    """Put the chapter's number before the notebook's title, and what sets the page apart from its like behind (in place)."""
-    chapter, _, more = page.partition("-")
-    cell = first_text(notebook)
-    title = rf"# {int(chapter[:2])}. \1" + (f": {more}" if more else "")
-    cell.source = re.sub(r"^# (.*)$", title, cell.source, count=1, flags=re.MULTILINE)
+    for cell in notebook.cells:
+        tags = set(cell.metadata.get("tags", []))
+        names = {
+            "parameters": "parameters",
+            "injected-parameters": "parameters of this run",
+            "hide-input": "plot code",
+            "hide-cell": "setup",
+        }
+        words = next((words for tag, words in names.items() if tag in tags), "")
+        if words:
+            prompts = {f"code_prompt_{do}": f"{do.title()} {words}" for do in ("show", "hide")}
+            cell.metadata["mystnb"] = cell.metadata.get("mystnb", {}) | prompts
 
 
 def complete_captions(notebook: nbformat.NotebookNode, kind: str) -> None:
@@ -104,67 +84,15 @@ def complete_captions(notebook: nbformat.NotebookNode, kind: str) -> None:
             figure["caption"] = f"{figure['caption'].strip()} {kind} data."
 
 
-DEFINED = re.compile(
-    r"^\(([\w:.-]+)\)=\s*$|^:(?:label|name): *([\w:.-]+)\s*$|^\$\$ *\(([\w:.-]+)\)\s*$", re.MULTILINE
-)
-REFERRED = re.compile(r"(\{(?:ref|numref|eq)\}`(?:[^`<]*<)?|\]\(#?)([\w:.-]+)(?=>?`|\))")
-
-
-def relabel(notebook: nbformat.NotebookNode, suffix: str) -> None:
-    """Make the labels of a page its own, where one chapter is shown several times (in place).
-
-    Labels are known to the whole book; the numbered equations, figures and targets of the second copy would clash with
-    those of the first.
-    """
-    text = [cell for cell in notebook.cells if cell.cell_type == "markdown"]
-    figures = [figure_of(cell) for cell in notebook.cells if figure_of(cell)]
-    labels = {match[match.lastindex] for cell in text for match in DEFINED.finditer(cell.source)}
-    labels |= {figure["name"] for figure in figures if "name" in figure}
-
-    def renamed(match: re.Match) -> str:
-        return match[1] + match[2] + (suffix if match[2] in labels else "")
-
-    def redefined(match: re.Match) -> str:
-        label = match[match.lastindex]
-        return match[0].replace(label, label + suffix)
-
-    for cell in text:
-        cell.source = REFERRED.sub(renamed, DEFINED.sub(redefined, cell.source))
-    for figure in figures:
-        figure |= {"name": figure["name"] + suffix} if "name" in figure else {}
-        figure |= {"caption": REFERRED.sub(renamed, figure["caption"])} if "caption" in figure else {}
-
-
-def point_to_pages(text: str, pages: dict[str, Run]) -> str:
-    """Point links between chapters to the pages of the book: a chapter shown several times to its first page.
-
-    Links and glued numbers only: a command keeps the name of the notebook's file.
-    """
-    for chapter in CHAPTERS:
-        first = next(page for page, run in pages.items() if run.chapter == chapter)
-        text = re.sub(rf"(?<![\w-]){chapter}(?=\.ipynb(?:::|[)#>]))", first, text)
-    return text
-
-
 def stage_notebooks(config: dict, book: Path) -> None:
     """Copy the executed notebooks that the book shows; a run with a fault ends the staging."""
-    pages = chapters.book_pages(config)
-    seen: set[str] = set()
     kind = "Simulated" if all(session.startswith("sim-") for session in config["sessions"]) else "Real"
     (book / "notebooks").mkdir()
-    for page, run in pages.items():
+    for run in chapters.book_pages(config):
         notebook = chapters.load_run(run.path(config["out_dir"]), NOTEBOOKS / f"{run.chapter}.ipynb")
-        fold_parameters(notebook)
+        name_folded_cells(notebook)
         complete_captions(notebook, kind)
-        open_with_picture(notebook, book / "images", page, kind)
-        number_title(notebook, page)
-        if run.chapter in seen:
-            relabel(notebook, re.sub(r"\W+", "-", page.removeprefix(run.chapter)))
-        seen.add(run.chapter)
-        for cell in notebook.cells:
-            if cell.cell_type == "markdown":
-                cell.source = point_to_pages(cell.source, pages)
-        nbformat.write(notebook, book / "notebooks" / f"{page}.ipynb")
+        nbformat.write(notebook, book / "notebooks" / f"{run.chapter}.ipynb")
 
 
 def png_of(cell: nbformat.NotebookNode) -> bytes | None:
@@ -178,7 +106,7 @@ def png_of(cell: nbformat.NotebookNode) -> bytes | None:
 def stage_result_figure(config: dict, book: Path) -> None:
     """Write the picture of the first page, and the words below it: of real data where a run shows them."""
     for chapter, name, words in RESULT_FIGURES:
-        run = next((run for run in chapters.book_pages(config).values() if run.chapter == chapter), None)
+        run = next((run for run in chapters.book_pages(config) if run.chapter == chapter), None)
         cells = chapters.read_notebook(run.path(config["out_dir"])).cells if run else []
         png = next((png_of(cell) for cell in cells if figure_of(cell).get("name") == name), None)
         if png:
@@ -192,20 +120,12 @@ def stage_result_figure(config: dict, book: Path) -> None:
 # ---- table of contents ----------------------------------------------------------------------------------------
 
 
-def expand_contents(contents: dict, pages: dict[str, Run], toolbox: list[dict]) -> dict:
-    """Replace every chapter in the table of contents by its pages, and add the entries of the toolbox."""
+def expand_contents(contents: dict, toolbox: list[dict]) -> dict:
+    """Add the pages of the packages to the table of contents, below the entry of the toolbox (in place)."""
     for part in contents["parts"]:
-        entries = []
         for entry in part["chapters"]:
-            name = entry["file"].removeprefix("notebooks/")
-            if name in CHAPTERS:
-                own = [page for page, run in pages.items() if run.chapter == name]
-                entries += [{"file": f"notebooks/{page}"} for page in own]
-            elif entry["file"] == "toolbox/index":
-                entries.append(entry | {"sections": toolbox})
-            else:
-                entries.append(entry)
-        part["chapters"] = entries
+            if entry["file"] == "toolbox/index":
+                entry["sections"] = toolbox
     return contents
 
 
@@ -346,10 +266,7 @@ def stage(config_path: str) -> Path:
     toolbox = stage_toolbox(book)
     write_text(book / "made.md", how_made_page(config, config_path))
     write_text(book / "did_it_reproduce.md", reproduced_page(config))
-    pages = chapters.book_pages(config)
-    for page in book.glob("*.md"):
-        write_text(page, point_to_pages(read_text(page), pages))
-    contents = expand_contents(yaml.safe_load(read_text(book / "_toc.yml")), pages, toolbox)
+    contents = expand_contents(yaml.safe_load(read_text(book / "_toc.yml")), toolbox)
     write_text(book / "_toc.yml", yaml.safe_dump(contents, sort_keys=False))
     stage_settings(book, os.environ)
     return book

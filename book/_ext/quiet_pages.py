@@ -16,8 +16,6 @@ from sphinx.application import Sphinx
 USELESS = re.compile(
     r'\s*<link rel="preload"[^>]*>|\s*<script src="[^"]*/fontawesome/[^"]*\.js[^"]*"></script>', re.IGNORECASE
 )
-# A chapter that runs for several sessions has several pages and one notebook.
-OF_ONE_RUN = re.compile(r"(notebooks/\d\d_[a-z0-9_]+)-[\w-]+(?=\.ipynb)")
 # A glued sentence is plain text to Sphinx; the code in it stands in backticks.
 GLUED = re.compile(r'(<span class="pasted-text">)([^<]*`[^<]*)(?=</span>)')
 
@@ -33,16 +31,6 @@ def leave_out_scripts(app: Sphinx, pagename: str, templatename: str, context: di
     context["css_files"] = [
         sheet for sheet in context.get("css_files", []) if "thebe" not in str(sheet.filename)
     ]
-
-
-def point_to_stored(app: Sphinx, pagename: str, templatename: str, context: dict, doctree: object) -> None:
-    """Let a launch button open the notebook as the repository keeps it, under its chapter's name (in place)."""
-    waiting = list(context.get("header_buttons", []))
-    while waiting:
-        button = waiting.pop()
-        waiting += button.get("buttons", [])
-        if "://" in button.get("url", ""):
-            button["url"] = OF_ONE_RUN.sub(r"\1", button["url"])
 
 
 def show_code(match: re.Match) -> str:
@@ -84,7 +72,6 @@ def readable_defaults(
 def setup(app: Sphinx) -> dict:
     """Tell Sphinx when to call what."""
     app.connect("html-page-context", leave_out_scripts, priority=900)
-    app.connect("html-page-context", point_to_stored, priority=901)
     app.connect("autodoc-process-signature", readable_defaults)
     app.connect("doctree-read", forget_parts)
     app.connect("build-finished", clean_pages)

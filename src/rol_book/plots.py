@@ -7,11 +7,13 @@ ground have x (forward) up and y (left) to the left, in metres, with the sensor 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
+from matplotlib.figure import Figure
 from matplotlib.quiver import Quiver
 
 # Distinct for colour-blind readers, and by lightness on grey paper (Okabe and Ito 2008).
@@ -23,6 +25,18 @@ COLOURS = {
     "truth": "#000000",
     "estimate": "#D55E00",
 }
+
+# Lines and markers of methods and front ends; a figure that compares them uses these.
+METHOD_COLOURS = {"paper": "#0072B2", "robust": "#D55E00"}
+FRONT_END_COLOURS = {
+    "k-strongest": "#E69F00",
+    "cfar": "#CC79A7",
+    "paper": "#0072B2",
+    "paper-no-gan": "#56B4E9",
+    "unet": "#009E73",
+}
+
+WIDTH = 9.0  # of every figure [inches]
 
 # For sessions, in this order: distinct for colour-blind readers too, and from all of the above.
 SESSION_COLOURS = ("#332288", "#33BBEE", "#EE3377", "#999933", "#7F3B08")
@@ -36,7 +50,7 @@ def style() -> None:
     plt.rcParams.update(
         {
             "figure.dpi": 120,
-            "figure.figsize": (9.0, 4.0),
+            "figure.figsize": (WIDTH, 4.0),
             "figure.constrained_layout.use": True,
             "font.size": 11.0,
             "axes.titlesize": 11.0,
@@ -57,6 +71,30 @@ def style() -> None:
             "image.cmap": "gray_r",
         }
     )
+
+
+def subplots(
+    n_rows: int = 1, n_columns: int = 1, *, height: float = 4.0, **options: Any
+) -> tuple[Figure, Any]:
+    """Make a figure of the book's width.
+
+    Parameters
+    ----------
+    n_rows, n_columns : int
+        Rows and columns of panels.
+    height : float
+        Height of the figure [inches].
+    **options
+        Options of `matplotlib.pyplot.subplots`, such as ``sharex`` or ``width_ratios``.
+
+    Returns
+    -------
+    figure : Figure
+        The figure.
+    axes : Axes, or array of Axes
+        Its panels, as `matplotlib.pyplot.subplots` returns them.
+    """
+    return plt.subplots(n_rows, n_columns, figsize=(WIDTH, height), **options)
 
 
 # ---- images in metres ----

@@ -46,7 +46,9 @@ def is_inside(address: str) -> bool:
 
 
 def test_every_chapter_has_its_page_with_a_title_of_its_own(profile: dict, html: Path) -> None:
-    titles = [read_page(html / "notebooks" / f"{page}.html").h1.get_text() for page in book_pages(profile)]
+    titles = [
+        read_page(html / "notebooks" / f"{run.chapter}.html").h1.get_text() for run in book_pages(profile)
+    ]
     assert len(set(titles)) == len(titles)
 
 
@@ -114,7 +116,7 @@ def test_every_image_exists_and_has_alt_text(html: Path) -> None:
 
 
 def test_every_caption_says_simulated_or_real(profile: dict, html: Path) -> None:
-    for page in book_pages(profile):
+    for page in (run.chapter for run in book_pages(profile)):
         for caption in read_page(html / "notebooks" / f"{page}.html").select("figcaption .caption-text"):
             assert re.search("simulated|real", caption.get_text(), re.IGNORECASE), (
                 f"{page}: {caption.get_text()}"

@@ -12,7 +12,6 @@ from nbformat.v4 import new_code_cell, new_markdown_cell, new_notebook, new_outp
 
 import chapters
 import renew_notebooks
-import stage_book
 from chapters import CHAPTERS, NOTEBOOKS, ChapterError, Run
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -344,18 +343,6 @@ def test_run_takes_the_text_of_its_source_and_refuses_other_code(tmp_path: Path)
     write_notebook(source, parameters_cell("n = 1"), new_code_cell("print(n + 1)"))
     with pytest.raises(ChapterError, match="run the chapter again"):
         chapters.load_run(run, source)
-
-
-def test_second_page_of_a_chapter_gets_labels_of_its_own() -> None:
-    text = "(place)=\nSee {ref}`place`, {eq}`eq-8`, {numref}`fig <fig-a>`, [x](#place) and other places.\n\n$$\nx\n$$ (eq-8)"
-    figure = {"mystnb": {"figure": {"name": "fig-a", "caption": "See {eq}`eq-8`."}}}
-    notebook = new_notebook(cells=[new_markdown_cell(text), new_code_cell("x", metadata=figure)])
-    stage_book.relabel(notebook, "-s")
-    assert notebook.cells[0].source == (
-        "(place-s)=\nSee {ref}`place-s`, {eq}`eq-8-s`, {numref}`fig <fig-a-s>`, [x](#place-s) and other places.\n\n"
-        "$$\nx\n$$ (eq-8-s)"
-    )
-    assert notebook.cells[1].metadata.mystnb.figure == {"name": "fig-a-s", "caption": "See {eq}`eq-8-s`."}
 
 
 def test_stripping_leaves_nothing_of_the_machine() -> None:

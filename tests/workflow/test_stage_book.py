@@ -263,24 +263,7 @@ def test_default_that_is_made_anew_is_shown_as_dots(quiet_pages: ModuleType) -> 
     assert quiet_pages.readable_defaults(None, *words, None, None) == (None, None)
 
 
-# ---- links and the first picture ------------------------------------------------------------------------------
-
-
-def test_links_lead_to_pages_and_commands_keep_the_file() -> None:
-    pages = {"07_localization-seq01": SimpleNamespace(chapter="07_localization")}
-    pages |= {
-        chapter: SimpleNamespace(chapter=chapter) for chapter in CHAPTERS if chapter != "07_localization"
-    }
-    told = stage_book.point_to_pages(
-        "[a](notebooks/07_localization.ipynb) [b](07_localization.ipynb#x) {glue:text}`07_localization.ipynb::rmse:.2f`\n"
-        "papermill notebooks/07_localization.ipynb out.ipynb; my_07_localization.ipynb; [c](08_results.ipynb)",
-        pages,
-    )
-    assert told == (
-        "[a](notebooks/07_localization-seq01.ipynb) [b](07_localization-seq01.ipynb#x) "
-        "{glue:text}`07_localization-seq01.ipynb::rmse:.2f`\n"
-        "papermill notebooks/07_localization.ipynb out.ipynb; my_07_localization.ipynb; [c](08_results.ipynb)"
-    )
+# ---- the first picture ------------------------------------------------------------------------------
 
 
 def write_run(path: Path, figure: str, png: bytes | None) -> SimpleNamespace:
@@ -300,7 +283,7 @@ def test_first_picture_is_real_where_it_can_be(
     for name in ("real.md", "simulated.md"):
         (book / "images" / name).write_text(name, encoding="utf-8")
     pngs = {"10_real_radar": real, "07_localization": b"simulated"}
-    runs = {c: write_run(book / f"{c}.ipynb", f, pngs[c]) for c, f, _ in stage_book.RESULT_FIGURES}
+    runs = [write_run(book / f"{c}.ipynb", f, pngs[c]) for c, f, _ in stage_book.RESULT_FIGURES]
     monkeypatch.setattr(chapters, "book_pages", lambda config: runs)
     stage_book.stage_result_figure({"out_dir": ""}, book)
     assert (book / "images" / "result.png").read_bytes() == (real or b"simulated")
@@ -308,65 +291,24 @@ def test_first_picture_is_real_where_it_can_be(
 
 
 def test_book_without_a_first_picture_is_refused(book: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    runs = {"07": write_run(book / "07_localization.ipynb", "fig-trajectory", None)}
+    runs = [write_run(book / "07_localization.ipynb", "fig-trajectory", None)]
     monkeypatch.setattr(chapters, "book_pages", lambda config: runs)
     with pytest.raises(ChapterError, match="no PNG figure named fig-trajectory"):
         stage_book.stage_result_figure({"out_dir": ""}, book)
 
 
-# ---- what opens a chapter -------------------------------------------------------------------------------------
+# ---- hidden cells ---------------------------------------------------------------------------------------------
 
 
-def chapter_with(*figures: tuple[str, bytes | None, str | None]) -> nbformat.NotebookNode:
-    """A chapter with figures: name, picture, and the sentence that lets it open the chapter."""
-    cells = [
-        nbformat.v4.new_markdown_cell("# Title\n\nPurpose."),
-        nbformat.v4.new_code_cell("a = 1", metadata={"tags": ["parameters"]}),
-        nbformat.v4.new_code_cell("a = 2", metadata={"tags": ["injected-parameters"]}),
-    ]
-    for name, png, opening in figures:
-        metadata = {"mystnb": {"figure": {"name": name}, "image": {"alt": f"Alt of {name}"}}}
-        metadata |= {"opening": opening} if opening else {}
-        data = {"image/png": base64.b64encode(png).decode()} if png else {"text/plain": "nothing"}
-        output = nbformat.v4.new_output("display_data", data)
-        cells.append(nbformat.v4.new_code_cell("", outputs=[output], metadata=metadata))
-    return nbformat.v4.new_notebook(cells=cells)
-
-
-def test_chapter_opens_with_the_last_picture_that_was_drawn(tmp_path: Path) -> None:
-    notebook = chapter_with(
-        ("fig-a", b"a", None), ("fig-b", b"b", "B"), ("fig-c", b"c", "C ({kind} data)"), ("fig-d", None, "D")
-    )
-    stage_book.open_with_picture(notebook, tmp_path / "images", "05_chapter", "Simulated")
-    assert (tmp_path / "images/opening-05_chapter.png").read_bytes() == b"c"
-    lines = notebook.cells[0].source.split("\n")
-    assert lines[:3] == ["# Title", "", "Purpose."] and ":alt: Alt of fig-c" in lines
-    assert "```{image} ../images/opening-05_chapter.png" in lines
-    assert "C (simulated data) ({numref}`fig-c`)." in lines
-
-
-def test_chapter_without_a_drawn_picture_opens_without_one(tmp_path: Path) -> None:
-    notebook = chapter_with(("fig-a", b"a", None), ("fig-b", None, "B"))
-    stage_book.open_with_picture(notebook, tmp_path / "images", "09_chapter", "Real")
-    assert notebook.cells[0].source == "# Title\n\nPurpose." and not (tmp_path / "images").exists()
-
-
-def test_parameters_lie_behind_lines_that_name_them() -> None:
-    notebook = chapter_with()
-    stage_book.fold_parameters(notebook)
-    for cell, words in zip(notebook.cells[1:], ("parameters", "parameters of this run"), strict=True):
-        assert "hide-input" in cell.metadata["tags"]
-        assert cell.metadata["mystnb"]["code_prompt_show"] == f"Show the {words}"
-
-
-def test_every_chapter_has_a_figure_that_opens_it() -> None:
-    for chapter in CHAPTERS:
-        cells = nbformat.read(NOTEBOOKS / f"{chapter}.ipynb", as_version=4).cells
-        opening = [cell.metadata for cell in cells if "opening" in cell.metadata]
-        assert opening, chapter
-        for metadata in opening:
-            assert metadata["mystnb"]["figure"]["name"] and metadata["mystnb"]["image"]["alt"]
-            assert not metadata["opening"].rstrip().endswith(".")  # the reference to the figure follows
+def test_hidden_cells_say_what_they_hold() -> None:
+    tags = (["parameters"], ["injected-parameters"], ["hide-cell"], ["hide-input"], [])
+    cells = [nbformat.v4.new_code_cell("a = 1", metadata={"tags": tag}) for tag in tags]
+    cells[3].metadata["mystnb"] = {"image": {"alt": "words"}}
+    stage_book.name_folded_cells(nbformat.v4.new_notebook(cells=cells))
+    shown = [cell.metadata.get("mystnb", {}).get("code_prompt_show") for cell in cells]
+    assert shown == ["Show parameters", "Show parameters of this run", "Show setup", "Show plot code", None]
+    assert all("hide-input" in cell.metadata["tags"] for cell in cells[:2])
+    assert cells[3].metadata["mystnb"]["image"] == {"alt": "words"}
 
 
 # ---- captions -------------------------------------------------------------------------------------------------
