@@ -74,7 +74,8 @@ def find_gaps(image: np.ndarray, n_panels: int) -> list[int] | None:
 
 def stack_panels(path: Path, n_panels: int) -> Path | None:
     """Write a picture with the panels of another one below each other; None where they cannot be separated."""
-    picture = Image.open(path).convert("RGB")
+    with Image.open(path) as stored:
+        picture = stored.convert("RGB")
     cuts = find_gaps(np.asarray(picture.convert("L")), n_panels)
     if cuts is None:
         return None

@@ -53,7 +53,8 @@ def test_narrow_windows_get_the_stacked_picture(figures: ModuleType, tmp_path: P
     words = page.read_text()
     assert '(max-width: 700px)" srcset="../_images/a-stacked.png"><img alt="x"' in words
     assert words.count("<picture>") == 1
-    assert Image.open(tmp_path / "_images" / "a-stacked.png").size == (100, 100)
+    with Image.open(tmp_path / "_images" / "a-stacked.png") as stacked:
+        assert stacked.size == (100, 100)
 
 
 def test_figure_of_a_table_is_a_table(figures: ModuleType) -> None:
