@@ -102,13 +102,13 @@ def draw_drift(axes: Sequence[Axes], ways: pd.DataFrame, colours: Mapping[str, s
             bars = [[middle - low], [high - middle]]
             drift.errorbar(middle, place + up, xerr=bars, fmt="o", markerfacecolor=face, markersize=6, **look)
         time.barh(place, row["step [ms]"], color=look["color"], height=0.55)
-    for label, face in (("as recorded", "white"), ("compensated before", "#444444")):
+    for label, face in (("clouds as recorded", "white"), ("clouds compensated before", "#444444")):
         drift.plot([], [], "o", color="#444444", markerfacecolor=face, label=label)
     drift.set_yticks(places, names)
     drift.set(xscale="log", xlabel="drift [%]", xlim=(0.05, 4.0))
     drift.set_xticks([0.1, 0.3, 1, 3], ["0.1", "0.3", "1", "3"])
     drift.minorticks_off()
-    drift.legend(title="clouds", loc="lower left")
+    drift.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=2)
     time.set(xlabel="time per scan [ms]")
     time.tick_params(labelleft=False)
     return axes

@@ -13,6 +13,11 @@ from matplotlib.collections import LineCollection
 from rol.geometry import transform_points
 from rol_book import plots
 
+PLACES = {  # of a name: offset [points], alignments
+    "above": ((6, 5), "left", "bottom"),
+    "above left": ((-6, 5), "right", "bottom"),
+    "below": ((0, -9), "center", "top"),
+}
 AXIS_COLOURS = {"x": plots.COLOURS["estimate"], "y": plots.COLOURS["fake"]}
 
 
@@ -51,7 +56,7 @@ def draw_turn(
     ax.plot(
         range_m * np.sin(circle), range_m * np.cos(circle), color="#444444", linestyle="--", linewidth=1.0
     )
-    ax.scatter(tips[:, 1], tips[:, 0], c=1e3 * seconds, s=9, linewidths=0, zorder=3)
+    ax.scatter(tips[:, 1], tips[:, 0], c=1e3 * seconds, s=9, cmap="viridis", linewidths=0, zorder=3)
     ax.plot(row_poses[:, 1], row_poses[:, 0], color="black", linewidth=2.4, zorder=4)
     ax.set_aspect("equal")
     ax.invert_xaxis()
@@ -87,7 +92,7 @@ def draw_displacement(ax: Axes, row_poses: np.ndarray, azimuths: np.ndarray) -> 
     return ax
 
 
-def draw_frame(ax: Axes, pose: np.ndarray, name: str, *, length: float, below: bool = False) -> Axes:
+def draw_frame(ax: Axes, pose: np.ndarray, name: str, *, length: float, place: str = "above") -> Axes:
     """Draw the two axes of a frame from above, with its name: x up, y to the left.
 
     Parameters
@@ -100,8 +105,8 @@ def draw_frame(ax: Axes, pose: np.ndarray, name: str, *, length: float, below: b
         Name, written beside the origin.
     length : float
         Length of an axis [m].
-    below : bool
-        Write the name below the origin instead of above it.
+    place : str
+        Where the name is written: "above", "above left" or "below" the origin.
 
     Returns
     -------
@@ -111,23 +116,13 @@ def draw_frame(ax: Axes, pose: np.ndarray, name: str, *, length: float, below: b
     x, y, yaw = pose
     for axis, turn in (("x", 0.0), ("y", np.pi / 2.0)):
         tip = y + length * np.sin(yaw + turn), x + length * np.cos(yaw + turn)
-        look = {
-            "arrowstyle": "-|>",
-            "color": AXIS_COLOURS[axis],
-            "linewidth": 1.8,
-            "shrinkA": 0,
-            "shrinkB": 0,
-        }
+        look = {"arrowstyle": "-|>", "color": AXIS_COLOURS[axis], "linewidth": 1.8, "shrinkA": 0}
         ax.annotate("", xy=tip, xytext=(y, x), arrowprops=look, zorder=4)
         end = y + 1.18 * (tip[0] - y), x + 1.18 * (tip[1] - x)
         ax.text(*end, axis, color=AXIS_COLOURS[axis], ha="center", va="center", fontsize=9.5)
     ax.plot(y, x, "o", color="black", markersize=4.5, zorder=5)
-    place = {
-        "xytext": (6, -7 if below else 5),
-        "textcoords": "offset points",
-        "va": "top" if below else "bottom",
-    }
-    ax.annotate(name, (y, x), ha="left", **place)
+    offset, across, along = PLACES[place]
+    ax.annotate(name, (y, x), xytext=offset, textcoords="offset points", ha=across, va=along)
     return ax
 
 
@@ -154,7 +149,7 @@ def draw_map_frames(ax: Axes, path: np.ndarray, pose: np.ndarray) -> Axes:
     ax.annotate("", xy=(pose[1], pose[0]), xytext=(0.0, 0.0), arrowprops=look)
     middle = 0.5 * pose[1], 0.5 * pose[0]
     ax.annotate("T_map_radar", middle, xytext=(6, 0), textcoords="offset points", va="center")
-    draw_frame(ax, np.zeros(3), "map", length=length, below=True)
+    draw_frame(ax, np.zeros(3), "map", length=length, place="below")
     draw_frame(ax, pose, "radar", length=length)
     ax.set_title("map and radar")
     ax.margins(0.18)
@@ -181,8 +176,9 @@ def draw_mounting(ax: Axes, extrinsics: Mapping[str, np.ndarray]) -> Axes:
         x, y, z = transform[:3, 3]
         yaw = np.arctan2(transform[1, 0], transform[0, 0])
         name = f"{sensor.replace('velodyne_', 'lidar, ')}\nz = {z:.2f} m"
-        draw_frame(ax, np.array([x, y, yaw]), name, length=0.25, below=sensor == "radar")
+        place = {"radar": "below", "velodyne_left": "above left"}.get(sensor, "above")
+        draw_frame(ax, np.array([x, y, yaw]), name, length=0.25, place=place)
     ax.set_aspect("equal")
-    ax.set(title="sensors on the vehicle", xlim=(0.9, -1.2), ylim=(-1.15, 0.45))
+    ax.set(title="sensors on the vehicle", xlim=(0.95, -1.05), ylim=(-1.2, 0.45))
     ax.set(xlabel="y, to the left [m]", ylabel="x, forward [m]")
     return ax

@@ -55,7 +55,7 @@ def draw_statistics(axes: np.ndarray, found: Mapping[str, dict]) -> np.ndarray:
     for ax, draw in zip(axes.ravel(), draws, strict=True):
         for (name, statistics), look in zip(found.items(), STYLES, strict=False):
             draw(ax, statistics, {**look, "label": name})
-    axes[0, 0].legend(loc="upper right")
+    axes[0, 0].legend(loc="lower left", handlelength=1.2, borderaxespad=0.2)
     return axes
 
 
