@@ -108,7 +108,7 @@ def draw_drift(axes: Sequence[Axes], ways: pd.DataFrame, colours: Mapping[str, s
     drift.set(xscale="log", xlabel="drift [%]", xlim=(0.05, 4.0))
     drift.set_xticks([0.1, 0.3, 1, 3], ["0.1", "0.3", "1", "3"])
     drift.minorticks_off()
-    drift.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=2)
+    drift.figure.legend(*drift.get_legend_handles_labels(), loc="outside upper center", ncols=2)
     time.set(xlabel="time per scan [ms]")
     time.tick_params(labelleft=False)
     return axes
