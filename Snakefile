@@ -117,7 +117,12 @@ ALL_MADE = [session_made(session) for session in SESSIONS]
 
 # Rule: its chapter, its message, and the files that it reads and writes besides its notebook. 04 has a rule of its own.
 STEPS = {
-    "sessions": ("01_sessions", "sessions", {"sessions": ALL_MADE}, {}),
+    "sessions": (
+        "01_sessions",
+        "sessions",
+        {"sessions": ALL_MADE, "tables": found("data/paper/*.csv")},
+        {},
+    ),
     "alignment": ("02_alignment", "alignment, {wildcards.session}", {"session": of_session}, {"alignment": ALIGNMENT}),
     "ground_removal": (
         "03_ground_removal",
@@ -180,6 +185,7 @@ STEPS = {
         {},
     ),
     "runtime": ("14_runtime", "runtime", {"measured": found("data/performance/*.json")}, {}),
+    "simulator": ("15_simulator", "the simulator", {"session": session_made(TRAIN)}, {}),
 }
 def clear_images(folder, listing, code):
     """Write the command that removes the images of other code from a folder: a job goes on with those of a stopped run."""

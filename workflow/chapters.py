@@ -46,6 +46,7 @@ CHAPTERS = {
     "12_robust_filter": "once",
     "13_ablations": "once",
     "14_runtime": "once",
+    "15_simulator": "once",
 }
 LISTS, FOLDERS = ("sessions", "methods"), ("sessions_root", "out_dir", "book_dir")
 CONFIG_KEYS = {"profile", *LISTS, *FOLDERS, "seed", "notebooks", "simulated"}

@@ -8,32 +8,42 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.image import AxesImage
 
 from rol.radar import MEASURED
+from rol_book import plots
 
 STYLES = (
-    {"color": "#0072B2", "linestyle": "-"},
-    {"color": "#E69F00", "linestyle": "-"},
-    {"color": "#009E73", "linestyle": "--"},
+    {"color": plots.COLOURS["real"], "linestyle": "-"},
+    {"color": plots.COLOURS["radar"], "linestyle": "-"},
+    {"color": plots.COLOURS["fake"], "linestyle": "--"},
 )
 GREYS = plt.get_cmap("gray_r", 12)  # few levels: noise in fine ones makes large files and shows no more
 
 
-def draw_statistics(found: Mapping[str, dict]) -> Figure:
+def format_value(value: float) -> str:
+    """Format a number of a table of mixed units: three significant digits, no exponent, a dash for NaN."""
+    if not np.isfinite(value):
+        return "–"
+    return f"{value:,.0f}" if value == 0 or abs(value) >= 100 else f"{value:.3g}"
+
+
+def draw_statistics(axes: np.ndarray, found: Mapping[str, dict]) -> np.ndarray:
     """Draw the statistics of several sets of scans over each other, one panel for each statistic.
 
     Parameters
     ----------
+    axes : array of Axes, shape (2, 3)
+        Where to draw.
     found : mapping
         Name of a set -> its statistics, from `rol_study.radar_statistics.scan_statistics`; three sets at
         most, drawn in turn.
 
     Returns
     -------
-    figure : Figure
-        Six panels.
+    axes : array of Axes
+        The axes; the first one has the legend.
     """
-    figure, axes = plt.subplots(2, 3, figsize=(9.6, 6.2), dpi=84)
     draws = (
         _draw_histogram,
         _draw_zeros,
@@ -45,12 +55,12 @@ def draw_statistics(found: Mapping[str, dict]) -> Figure:
     for ax, draw in zip(axes.ravel(), draws, strict=True):
         for (name, statistics), look in zip(found.items(), STYLES, strict=False):
             draw(ax, statistics, {**look, "label": name})
-    figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside upper left", ncols=3)
-    return figure
+    axes[0, 0].legend(loc="lower left", handlelength=1.2, borderaxespad=0.2)
+    return axes
 
 
 def draw_doppler(ax: Axes, found: Mapping[str, dict]) -> Axes:
-    """Draw how well scans agree for every Doppler shift tried, a cross where they agree best.
+    """Draw how well scans agree for every Doppler shift tried.
 
     Parameters
     ----------
@@ -68,13 +78,13 @@ def draw_doppler(ax: Axes, found: Mapping[str, dict]) -> Axes:
         shifts, values = (np.array(part) for part in zip(*statistics["doppler_curve"].items(), strict=True))
         ax.plot(1000.0 * shifts, values - values.max(), label=name, **look)
     ax.axvline(0.0, color="#444444", linewidth=0.8)
-    ax.set(xlabel="Doppler range shift per closing speed [ms]", ylabel="correlation, less its best")
+    ax.set(xlabel="Doppler range shift per closing speed [ms]", ylabel="correlation minus its maximum")
     ax.legend(loc="lower center")
     return ax
 
 
 def draw_auc_by_group(axes: Sequence[Axes], found: Mapping[str, Mapping[str, float]]) -> Sequence[Axes]:
-    """Draw which patches a classifier separates simulated from real scans.
+    """Draw how well a classifier separates simulated from real patches, by group.
 
     Parameters
     ----------
@@ -90,9 +100,8 @@ def draw_auc_by_group(axes: Sequence[Axes], found: Mapping[str, Mapping[str, flo
     """
     labels = {"range": "range of the patch [m]", "brightest": "brightest code in the patch"}
     for ax, (name, values) in zip(axes, found.items(), strict=True):
-        ax.bar(
-            list(values), [value - 0.5 for value in values.values()], bottom=0.5, color="#E69F00", width=0.7
-        )
+        above = [value - 0.5 for value in values.values()]
+        ax.bar(list(values), above, bottom=0.5, color=plots.COLOURS["radar"], width=0.7)
         ax.axhline(0.5, color="#444444", linewidth=1.0)
         ax.set(xlabel=labels.get(name, name), ylabel="area under the curve", ylim=(0.3, 1.0))
         ax.tick_params(axis="x", labelrotation=30)
@@ -143,25 +152,14 @@ def draw_lidar_statistics(found: Mapping[str, dict]) -> Figure:
     figure : Figure
         One map of the beams for each set above, four curves below.
     """
-    figure = plt.figure(figsize=(9.6, 6.0), dpi=72)
+    figure = plt.figure(figsize=(plots.WIDTH, 6.4))
     above, below = figure.subfigures(2, 1, height_ratios=(1.0, 1.05))
     whole = {name: statistics for name, statistics in found.items() if not statistics["is_part"]}
     maps = above.subplots(1, len(whole), sharey=True, squeeze=False)[0]
     for ax, (name, statistics) in zip(maps, whole.items(), strict=True):
-        image = ax.imshow(
-            statistics["return_fractions"],
-            cmap="viridis",
-            aspect="auto",
-            vmin=0,
-            vmax=1,
-            extent=(0, 360, 32, 0),
-            interpolation="nearest",
-        )
-        ax.set(title=name, xlabel="direction", yticks=(0, 8, 16, 24, 31))
-        ax.set_xticks(np.arange(0, 361, 90), ["right", "behind", "left", "ahead", "right"])
-        ax.grid(False)
+        image = _draw_beams(ax, statistics["return_fractions"], name)
     maps[0].set_ylabel("laser, highest on top")
-    above.colorbar(image, ax=maps, label="fraction of beams that return", pad=0.01)
+    above.colorbar(image, ax=maps, label="beams that return", pad=0.01)
     axes = below.subplots(1, 4)
     for statistics in (statistics for statistics in found.values() if statistics["is_part"]):
         _draw_sweep_curves(axes, statistics, {**STYLES[0], "linewidth": 0.6, "alpha": 0.7})
@@ -171,10 +169,18 @@ def draw_lidar_statistics(found: Mapping[str, dict]) -> Figure:
     return figure
 
 
+def _draw_beams(ax: Axes, fractions: np.ndarray, title: str) -> AxesImage:
+    image = ax.imshow(fractions, cmap="viridis", aspect="auto", vmin=0, vmax=1, extent=(0, 360, 32, 0))
+    ax.set(title=title, xlabel="direction", yticks=(0, 8, 16, 24, 31))
+    ax.set_xticks(np.arange(0, 361, 90), ["right", "behind", "left", "ahead", "right"])
+    ax.grid(False)
+    return image
+
+
 def _draw_sweep_curves(axes: Sequence[Axes], statistics: dict, look: dict) -> None:
     axes[0].plot(statistics["laser_counts"], np.arange(32), **look)
-    axes[0].set(xlabel="points per sweep", ylabel="laser, highest on top", xlim=(0, 1100), ylim=(31.5, -0.5))
-    labels = {"ranges": "range [m]", "heights": "height above radar [m]", "intensities": "intensity"}
+    axes[0].set(xlabel="points per sweep", ylabel="laser", xlim=(0, 1100), ylim=(31.5, -0.5))
+    labels = {"ranges": "range [m]", "heights": "height [m]", "intensities": "intensity"}
     for ax, (name, label) in zip(axes[1:], labels.items(), strict=True):
         fractions, edges = statistics["histograms"][name], statistics["edges"][name]
         ax.step(edges[:-1], fractions / np.diff(edges), where="post", **look)

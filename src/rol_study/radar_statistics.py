@@ -7,14 +7,18 @@ simulator. Rows are azimuths and neighbours in time (the turn is not closed); co
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from itertools import pairwise
 
 import cv2
 import numpy as np
+import pandas as pd
 from scipy.spatial import cKDTree
 
 from rol.geometry import relative_pose, transform_points
 from rol.lidar import crop_range, remove_ground
+from rol.oxford import Session, load_radar
+from rol.pairs import load_lidar_points, usable_sweeps
 from rol.radar import MEASURED, RangeCalibration, ScanMotion, k_strongest_peaks, polar_to_cartesian
 from rol.similarity import fraction_within, nn_distances
 from rol_sim.sensors.radar import beam_azimuths
@@ -25,6 +29,7 @@ NEAR_RANGES_M = (0.0, 0.86, 2.0, 3.0)
 PEAK_EDGES = (0, 110, 130, 133, 256)
 QUIET_CODE = 30  # a piece of a row whose codes stay below this holds noise and little else
 FAR_BIN = 3000
+HALF_TURN_US = 125_000
 
 
 def forbidden_codes() -> np.ndarray:
@@ -387,23 +392,56 @@ def summarize_scans(statistics: dict, reference: dict) -> dict[str, float]:
     rows : dict
         What it is -> number.
     """
-    floors, near, noise = statistics["floors"], statistics["near_field"], statistics["range_correlation"]
+    zeros, noise = statistics["zero_fractions"], statistics["range_correlation"]
     return {
         "Hellinger distance of the codes to real": hellinger_distance(
             statistics["histogram"], reference["histogram"]
         ),
-        **{f"fraction of codes >= {code}": fraction for code, fraction in statistics["fractions"].items()},
         **{
-            f"fraction of code 0 in quiet bins at {r:g} m": fraction
-            for r, fraction in statistics["zero_fractions"].items()
+            f"pixels with codes >= {code} [%]": 100.0 * statistics["fractions"][code]
+            for code in (40, 80, 120)
         },
-        **{f"noise correlation at {lag} bins": noise[lag - 1] for lag in (1, 3, 5, 7)},
-        "correlation of neighbouring azimuths": statistics["azimuth_correlation"],
-        **{f"mean code of the leakage at {r:g} m": code for r, code in near.items()},
-        **{f"far floor of rows that peak at {name}": code for name, code in floors.items()},
-        "greatest code": statistics["greatest"],
-        "pixels with a code that cannot be": statistics["forbidden"],
+        **{f"code 0 in quiet bins at {r:g} m [%]": 100.0 * zeros[r] for r in (3.0, 41.0, 145.0)},
+        **{f"noise correlation at {lag} bins": noise[lag - 1] for lag in (1, 3, 7)},
+        "noise correlation of neighbouring azimuths": statistics["azimuth_correlation"],
+        **{f"mean code of the leakage at {r:g} m": statistics["near_field"][r] for r in (0.86, 3.0)},
+        "largest code": statistics["greatest"],
+        "pixels with an impossible code": statistics["forbidden"],
     }
+
+
+def compare_statistics(statistics: dict, reference: dict) -> dict[str, float]:
+    """Compute the largest differences between the statistics of two sets of scans.
+
+    Parameters
+    ----------
+    statistics, reference : dict
+        From `scan_statistics`.
+
+    Returns
+    -------
+    differences : dict
+        "hellinger": distance of the codes' histograms; "brightness_min", "brightness_max": smallest and
+        largest ratio of the fractions of pixels at or above a code; "zeros", "noise": largest absolute
+        difference of the fractions of code 0 in quiet bins, and of the noise correlations along range.
+    """
+    names = ("fractions", "zero_fractions", "range_correlation")
+    bright, zeros, noise = (
+        np.array([_values(part[name]) for part in (statistics, reference)]) for name in names
+    )
+    occurs = bright[1] > 0
+    ratios = bright[0, occurs] / bright[1, occurs]
+    return {
+        "hellinger": hellinger_distance(statistics["histogram"], reference["histogram"]),
+        "brightness_min": float(ratios.min()),
+        "brightness_max": float(ratios.max()),
+        "zeros": float(np.nanmax(np.abs(zeros[0] - zeros[1]))),
+        "noise": float(np.max(np.abs(noise[0] - noise[1]))),
+    }
+
+
+def _values(statistic: dict | list) -> list[float]:
+    return list(statistic.values()) if isinstance(statistic, dict) else statistic
 
 
 def _fractions_by_range(
@@ -510,6 +548,58 @@ def relate_to_lidar(
         **{f"peaks with a lidar point within {r:g} m": fraction_within(echoes, r) for r in (1.0, 2.0)},
         **{f"lidar points with a peak within {r:g} m": fraction_within(seen, r) for r in (0.5, 1.0, 2.0)},
     }
+
+
+def summarize_agreement(motion: dict, fractions: np.ndarray) -> dict[str, float]:
+    """Select what scans at known poses show about motion and map, for a table.
+
+    Parameters
+    ----------
+    motion : dict
+        From `motion_statistics`.
+    fractions : array, shape (n, 2)
+        From `map_fractions`, within 1 m and 2 m.
+
+    Returns
+    -------
+    rows : dict
+        What it is -> number.
+    """
+    return {
+        "distance per turn [m]": motion["metres_per_turn"],
+        "correlation of scans, as recorded": motion["correlation_raw"],
+        "correlation, motion compensated": motion["correlation_motion"],
+        "correlation, Doppler compensated as well": motion["correlation_both"],
+        "best Doppler shift [ms]": 1e3 * motion["doppler_seconds"],
+        "peaks within 1 m of the map, mean [%]": 100.0 * fractions[:, 0].mean(),
+        "peaks within 1 m of the map, lowest scan [%]": 100.0 * fractions[:, 0].min(),
+        "peaks within 1 m of the map, highest scan [%]": 100.0 * fractions[:, 0].max(),
+        "peaks within 2 m of the map, mean [%]": 100.0 * fractions[:, 1].mean(),
+    }
+
+
+def relate_session(session: Session, stamps_us: Sequence[int]) -> pd.DataFrame:
+    """Compare the raw radar peaks of scans with the lidar sweeps nearest to their middle.
+
+    Parameters
+    ----------
+    session : Session
+        The session.
+    stamps_us : sequence of int
+        Names of the scans [us].
+
+    Returns
+    -------
+    relations : DataFrame
+        One row per scan, from `relate_to_lidar`.
+    """
+    sweeps_us, rows = usable_sweeps(session), []
+    for us in map(int, stamps_us):
+        scan = load_radar(session.radar_path(us))
+        nearest = {side: s[np.argmin(np.abs(s - us - HALF_TURN_US))] for side, s in sweeps_us.items()}
+        points = load_lidar_points(session, nearest.get("left"), nearest.get("right"))
+        rows.append(relate_to_lidar(scan.power, scan.azimuths, points, MEASURED))
+    return pd.DataFrame(rows)
 
 
 def _rows(codes: np.ndarray) -> np.ndarray:

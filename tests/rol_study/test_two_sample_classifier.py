@@ -68,6 +68,35 @@ def test_hellinger_distance_of_histograms() -> None:
     assert histogram.sum() == pytest.approx(1.0) and (histogram[statistics.forbidden_codes()] == 0.0).all()
 
 
+def test_differences_between_sets_of_scans() -> None:
+    quiet, louder = (statistics.scan_statistics(noise_scans(1, scale, 0)) for scale in (1.0, 1.5))
+    equal = statistics.compare_statistics(quiet, quiet)
+    assert equal == {
+        "hellinger": 0.0,
+        "brightness_min": 1.0,
+        "brightness_max": 1.0,
+        "zeros": 0.0,
+        "noise": 0.0,
+    }
+    found = statistics.compare_statistics(louder, quiet)
+    assert found["hellinger"] > 0.05 and found["brightness_max"] > 1.0 and found["zeros"] > 0.05
+    rows = statistics.summarize_scans(louder, quiet)
+    assert rows["Hellinger distance of the codes to real"] == found["hellinger"]
+
+
+def test_agreement_is_a_mean_with_its_extremes() -> None:
+    motion = dict.fromkeys(
+        ("metres_per_turn", "correlation_raw", "correlation_motion", "correlation_both"), 0.5
+    )
+    rows = statistics.summarize_agreement(
+        motion | {"doppler_seconds": 0.05}, np.array([[0.2, 0.4], [0.6, 0.8]])
+    )
+    assert rows["best Doppler shift [ms]"] == 50.0
+    means = [rows[f"peaks within {r} m of the map, mean [%]"] for r in (1, 2)]
+    assert means == pytest.approx([40.0, 60.0])
+    assert rows["peaks within 1 m of the map, lowest scan [%]"] == pytest.approx(20.0)
+
+
 def test_area_under_curve() -> None:
     assert two_sample_classifier.area_under_curve(np.array([2.0, 3.0]), np.array([0.0, 1.0])) == 1.0
     assert two_sample_classifier.area_under_curve(np.array([0.0, 1.0]), np.array([2.0, 3.0])) == 0.0

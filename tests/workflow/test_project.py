@@ -427,10 +427,10 @@ def test_smoke_profile_plans_every_run(workplace: Path) -> None:
         "ground_removal": "5",
         "generated_images": "5",
         "localization": "4",
-        "total": "36",
+        "total": "37",
         **dict.fromkeys(("book", "sessions", "pix2pix", "real_vs_fake", "ground_truth", "results"), "1"),
         **dict.fromkeys(("oxford_route", "robust_filter", "real_pairs", "real_radar"), "1"),
-        **dict.fromkeys(("ablations", "runtime"), "1"),
+        **dict.fromkeys(("ablations", "runtime", "simulator"), "1"),
     }
 
 
