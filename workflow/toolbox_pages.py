@@ -109,11 +109,8 @@ def stage_toolbox(book: Path) -> list[dict]:
             {"file": page_name(file), "title": module_name(file).removeprefix(f"{name}.")} for file in files
         ]
         entries.append({"file": page_name(package), "sections": sections})
-    above = (
-        "Functions and classes of `rol` by task, followed by the modules of the other packages that serve the same task."
-        " Each name links to its signature, docstring and code."
-        " [](../take.md) shows how to copy a module of `rol`."
-    )
+    above = "Functions of `rol` by task, then modules of the other packages; each name links to its documentation and code."
+    above += " [](../take.md) shows how to copy a module of `rol`."
     tasks = yaml.safe_load(read_text(book / "api.yml"))
     sections = [task_section(task, modules) for task, modules in tasks.items()]
     index = "\n".join([page_text("API", above, table_of(docstrings_of(packages))), *sections])
