@@ -23,10 +23,10 @@ from rol.files import read_text, write_bytes
 
 NAMES = ("chromium", "chromium-browser", "google-chrome")
 OFFLINE = "--host-resolver-rules=MAP * ~NOTFOUND"  # no name is resolved, so nothing leaves the machine
-WIDTH_PX = 850  # of the text, 180 mm, at the scale of the print
-PAPER = {"format": "A4", "scale": 0.8, "print_background": True, "outline": True, "tagged": True}
+WIDTH_PX = 907  # of the text, 180 mm, at the scale of the print
+PAPER = {"format": "A4", "scale": 0.75, "print_background": True, "outline": True, "tagged": True}
 MARGIN = {"top": "16mm", "bottom": "18mm", "left": "15mm", "right": "15mm"}
-NUMBER = '<p style="break-after: page; margin: 0; padding-top: 350mm; text-align: center">{}</p>'
+NUMBER = '<p style="break-after: page; margin: 0; padding-top: 375mm; text-align: center">{}</p>'
 
 
 def find_chromium() -> str | None:
