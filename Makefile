@@ -6,6 +6,7 @@
 # make judge       judge the weights of a network (NETWORK=unet) again and compare with their card
 # make real        fetch the small pieces of real data from public repositories into data/real (CHECK=1: only check them)
 # make seq01       the paper's Seq01 from the public radar images to Tables II and III (SESSION=folder: raw scans instead)
+# make pdf         the built book as one PDF, build/<profile>/radar_on_lidar.pdf; needs Chromium, after make book
 # make archive     one zip of code, executed notebooks, book and results with an RO-Crate, after make book
 # make clean       remove everything made by the above but .venv, data/real and the sessions that networks learn from
 #
@@ -14,7 +15,7 @@
 SHELL := bash
 .SHELLFLAGS := -eu -o pipefail -c
 .DEFAULT_GOAL := help
-.PHONY: help setup book test check notebooks weights judge real seq01 archive lint format clean
+.PHONY: help setup book test check notebooks weights judge real seq01 pdf archive lint format clean
 
 # UTF-8 whatever the locale is, also in the tools that are called.
 export PYTHONUTF8 := 1
@@ -70,6 +71,9 @@ real: $(STAMP)
 
 seq01: $(STAMP)
 	@OMP_WAIT_POLICY=PASSIVE $(BIN)/python -m rol_study.seq01 $(if $(SESSION),--session "$(SESSION)")
+
+pdf: $(STAMP)
+	@$(BIN)/python workflow/print_book.py config/$(PROFILE).yaml
 
 archive: $(STAMP)
 	@$(BIN)/python workflow/archive.py config/$(PROFILE).yaml

@@ -43,11 +43,6 @@ def figure_of(cell: nbformat.NotebookNode) -> dict:
     return cell.metadata.get("mystnb", {}).get("figure", {})
 
 
-def first_text(notebook: nbformat.NotebookNode) -> nbformat.NotebookNode:
-    """Give the first text cell, which holds the title."""
-    return next(cell for cell in notebook.cells if cell.cell_type == "markdown")
-
-
 def name_folded_cells(notebook: nbformat.NotebookNode) -> None:
     """Hide the parameters, and label each hidden cell by what it holds: parameters, setup, or plot code (in place)."""
     for tag in ("parameters", "injected-parameters"):
@@ -181,14 +176,8 @@ def stage_settings(book: Path, environment: Mapping[str, str]) -> None:
 
 def commit() -> str:
     """Name the commit of the working tree, where git knows it."""
-    words = [
-        "git",
-        "describe",
-        "--always",
-        "--abbrev=40",
-        "--exclude=*",
-        "--dirty=, with changes that are not committed",
-    ]
+    words = ["git", "describe", "--always", "--abbrev=40", "--exclude=*"]
+    words.append("--dirty=, with changes that are not committed")
     answer = subprocess.run(words, cwd=ROOT, capture_output=True, encoding="utf-8", check=False)
     return answer.stdout.strip() if answer.returncode == 0 else "not known (no git repository)"
 

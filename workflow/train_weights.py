@@ -21,15 +21,7 @@ import torch
 
 from rol_book.parameters import positive
 from rol_data.rall import find_real_root
-from rol_study.shipped_networks import (
-    Places,
-    compare_with_card,
-    list_variants,
-    load_recipe,
-    open_real,
-    open_sets,
-    run_networks,
-)
+from rol_study import shipped_networks as shipped
 
 DATA = Path(__file__).resolve().parents[1] / "data"
 WEIGHTS, ABLATIONS = DATA / "weights", DATA / "ablations" / "translator.csv"
@@ -52,18 +44,19 @@ def main(words: list[str] | None = None) -> int:
     """Train, evaluate and write what is asked for."""
     given = read_arguments(words)
     torch.set_num_threads(given.threads)
-    recipe = load_recipe(given.recipe)
-    variants = list_variants(recipe)
+    recipe = shipped.load_recipe(given.recipe)
+    variants = shipped.list_variants(recipe)
     known = {**recipe["networks"], **variants}
     names = list(variants) if given.network == "ablations" else [given.network]
     if names[0] not in known:
         raise ValueError(f"no network {given.network!r}; there are: {', '.join([*known, 'ablations'])}")
     report = partial(print, flush=True)
-    places = Places(given.recipe, WEIGHTS, ABLATIONS, find_real_root(), given.device, given.threads, report)
+    folders = given.recipe, WEIGHTS, ABLATIONS, find_real_root()
+    places = shipped.Places(*folders, given.device, given.threads, report)
     if given.judge:
-        agrees = compare_with_card(recipe, names[0], open_sets(recipe, [], places), open_real(places), places)
-        return 0 if agrees else 1
-    run_networks(recipe, {name: known[name] for name in names}, places)
+        held_out, real = shipped.open_sets(recipe, [], places), shipped.open_real(places)
+        return 0 if shipped.compare_with_card(recipe, names[0], held_out, real, places) else 1
+    shipped.run_networks(recipe, {name: known[name] for name in names}, places)
     return 0
 
 

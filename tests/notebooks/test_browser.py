@@ -7,8 +7,6 @@ fault each show that every rule can fail.
 from __future__ import annotations
 
 import base64
-import os
-import shutil
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
@@ -21,9 +19,8 @@ from axe_playwright_python.sync_playwright import Axe
 from playwright.sync_api import Browser, ConsoleMessage, Error, Request, sync_playwright
 
 from chapters import CHAPTERS
+from print_book import OFFLINE, find_chromium
 
-NAMES = ("chromium", "chromium-browser", "google-chrome")
-OFFLINE = "--host-resolver-rules=MAP * ~NOTFOUND"  # no name is resolved, so nothing leaves the machine
 LOCAL = ("file:", "data:", "blob:", "about:")
 CHECKS = Path(__file__).with_name("page.js").read_text(encoding="utf-8")
 AXE = Axe().axe_script
@@ -129,12 +126,6 @@ class Tab:
             self._faults.clear()
             visits.append(Visit(address, view, faults, **seen))
         return visits
-
-
-def find_chromium() -> str | None:
-    """Return the path of the browser: the environment's ``ROL_CHROMIUM``, else the first of the usual names."""
-    named = os.environ.get("ROL_CHROMIUM")
-    return next(filter(None, map(shutil.which, [named] if named else NAMES)), None)
 
 
 @contextmanager
@@ -448,17 +439,3 @@ def test_browser_that_does_not_start_says_so(tmp_path: Path) -> None:
     program.chmod(0o755)
     with ThreadPoolExecutor() as pool, pytest.raises(Error, match="no display today"):
         pool.submit(survey, str(program), [], set()).result()
-
-
-def test_browser_is_found_by_the_environment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    program = tmp_path / "google-chrome"
-    program.write_text("#!/bin/sh\n", encoding="utf-8")
-    program.chmod(0o755)
-    monkeypatch.setenv("PATH", str(tmp_path))
-    monkeypatch.delenv("ROL_CHROMIUM", raising=False)
-    assert find_chromium() == str(program)
-    monkeypatch.setenv("ROL_CHROMIUM", str(tmp_path / "gone"))
-    assert find_chromium() is None
-    monkeypatch.setenv("PATH", str(tmp_path / "empty"))
-    monkeypatch.delenv("ROL_CHROMIUM")
-    assert find_chromium() is None

@@ -21,8 +21,10 @@ import chapters
 import stage_book
 import toolbox_pages
 from chapters import CHAPTERS, NOTEBOOKS, ChapterError
+from toolbox_pages import module_name
 
 ROOT = Path(__file__).resolve().parents[2]
+TASKS = ROOT / "book" / "api.yml"
 KNOWN = {"ROL_REPOSITORY_URL": "https://git.example.org/people/radar.git"}
 
 
@@ -159,6 +161,7 @@ def test_metadata_files_of_macos_are_passed_over(tmp_path: Path, monkeypatch: py
 def test_toolbox_has_a_page_for_each_package_and_module(tmp_path: Path) -> None:
     text = "### [mcl](toolbox/rol/mcl.md)\n### [bev](toolbox/rol_other/bev.md)\n"
     (tmp_path / "take.md").write_text(text, encoding="utf-8")
+    shutil.copy(TASKS, tmp_path)
     entries = stage_book.stage_toolbox(tmp_path)
     pages = [page["file"] for entry in entries for page in (entry, *entry["sections"])]
     staged = {
@@ -176,6 +179,31 @@ def test_toolbox_has_a_page_for_each_package_and_module(tmp_path: Path) -> None:
     assert "(../../take.md#mcl)" in page
     assert ".. autofunction:: localize\n" in page and ".. autoclass:: MclSettings\n   :members:" in page
     assert "take.md" not in (tmp_path / "toolbox/rol/bev.md").read_text(encoding="utf-8")
+
+
+def test_every_public_name_and_every_module_has_one_task() -> None:
+    listed = [
+        f"{module}.{name}" if name else module_name(file)
+        for modules in yaml.safe_load(TASKS.read_text(encoding="utf-8")).values()
+        for module, names in modules.items()
+        for file in (
+            toolbox_pages.modules_in(chapters.SOURCE / module.replace(".", "/")) if not names else [None]
+        )
+        for name in names or [None]
+    ]
+    expected = []
+    for file in toolbox_pages.modules_in(chapters.SOURCE):
+        name = module_name(file)
+        members = toolbox_pages.public_members(file) if name.startswith("rol.") else []
+        expected += [f"{name}.{member.name}" for member in members] or [name]
+    assert sorted(listed) == sorted(expected)
+
+
+def test_task_lists_its_functions_and_whole_modules() -> None:
+    section = toolbox_pages.task_section("Map", {"rol.maps": ["load_map"], "rol_beyond.search": None})
+    assert section.startswith("## Map\n")
+    assert "   * - :py:obj:`maps.load_map <rol.maps.load_map>`\n     - Read a session's map.\n" in section
+    assert "   * - :py:obj:`rol_beyond.search`\n     - Global localization: " in section
 
 
 # ---- the pages' own extension ---------------------------------------------------------------------------------
@@ -203,23 +231,6 @@ def test_page_keeps_each_script_once_and_none_of_thebe(quiet_pages: ModuleType) 
         (None, "var a"),
     ]
     assert [sheet.filename for sheet in context["css_files"]] == ["book.css"]
-
-
-@pytest.mark.parametrize(
-    ("page", "notebook"),
-    [
-        ("07_localization-sim-town-seq02", "07_localization"),
-        ("07_localization-2019-01-10-12-32-52-radar-oxford-10k-paper", "07_localization"),
-        ("03_ground_removal", "03_ground_removal"),
-    ],
-)
-def test_button_opens_the_stored_notebook(quiet_pages: ModuleType, page: str, notebook: str) -> None:
-    start = "https://hub.example.org/v2/gh/people/radar/main?urlpath=lab/tree/notebooks/"
-    button, download = {"url": f"{start}{page}.ipynb"}, {"url": f"../_sources/notebooks/{page}.ipynb"}
-    context = {"header_buttons": [{"type": "group", "buttons": [button]}, download]}
-    quiet_pages.point_to_stored(None, "any", "page.html", context, None)
-    assert button["url"] == f"{start}{notebook}.ipynb"
-    assert download["url"] == f"../_sources/notebooks/{page}.ipynb"
 
 
 def test_finished_pages_are_cleaned(quiet_pages: ModuleType, tmp_path: Path) -> None:
