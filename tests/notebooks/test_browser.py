@@ -294,6 +294,19 @@ def test_print_is_black_on_white_and_has_no_controls(html: Path, tab: Tab) -> No
     assert tab.page.evaluate("document.documentElement.scrollWidth") <= 800
 
 
+def test_claims_of_one_outcome_are_shown_by_keyboard_and_all_in_print(html: Path, tab: Tab) -> None:
+    tab.open((html / "claims.html").as_uri(), WIDE)
+    rows = tab.page.locator("table.claims tbody tr")
+    outcomes = rows.locator(".sd-badge").all_inner_texts()
+    button = tab.page.get_by_role("button", name=f"untested ({outcomes.count('untested')})")
+    button.press("Enter")
+    assert set(rows.filter(visible=True).locator(".sd-badge").all_inner_texts()) == {"untested"}
+    assert button.get_attribute("aria-pressed") == "true"
+    tab.look(View(800, medium="print"))
+    assert rows.filter(visible=True).count() == len(outcomes) > 20
+    assert not tab.page.locator(".claims-filter").is_visible()
+
+
 # ---- the checker ----------------------------------------------------------------------------------------------
 
 DOT = base64.b64decode(

@@ -1,4 +1,4 @@
-"""The ledger of claims: every block is whole, says where its numbers come from, and agrees with the table on top."""
+"""Pages on claims and choices: each block is complete and names its evidence, and the tables agree with the blocks."""
 
 import re
 from dataclasses import dataclass
@@ -9,35 +9,31 @@ import pytest
 from chapters import CHAPTERS
 
 BOOK = Path(__file__).resolve().parents[2] / "book"
-# Verdict in a block -> its word in the table on top.
-VERDICTS = {
-    "reproduced": "reproduced",
-    "reproduced in part": "in part",
-    "contradicted": "contradicted",
-    "cannot be tested without the data set": "cannot be tested",
+# Outcome -> colour of its badge.
+OUTCOMES = {
+    "supported": "success",
+    "conditional": "warning",
+    "not supported": "danger",
+    "untested": "info",
+    "erratum or not empirical": "secondary",
 }
-COLOURS = {
-    "reproduced": "success",
-    "in part": "warning",
-    "contradicted": "danger",
-    "cannot be tested": "info",
-}
-OURS = ("Simulated", "Real route", "Real scans", "Times")  # lines whose numbers were computed
-MARKS = (*OURS, "The paper itself")
+OURS, TEXT = "ABCD", "T"  # evidence that was computed, and that of the paper's text alone
 # What the paper has: sections, and the last of its equations, figures and tables.
 PLACE = re.compile(r"Abstract|Sec\. (I|II|III-[AB]|IV-[ABC]|V)\b|Eq\. [1-9]\b|Fig\. [1-4]\b|Table I{1,3}\b")
 BLOCK = re.compile(r"^\((claim-[\w-]+)\)=\n### (\d+)\. (.+)\n", re.MULTILINE)
+BADGE = r"\{bdg-(\w+)-line\}`([^`]+)`"
 LINK = re.compile(r"\[[^\]]*\]\([^)]*\)")
-# Digits that a line of ours may hold besides glued ones: names, and limits that say what is counted.
+GLUED = re.compile(r"\{glue:text\}`notebooks/(\w+)\.ipynb::[\w-]+:[^`]+`")
+# Digits that a line of ours may contain besides glued ones: names, and limits.
 NAMES_AND_LIMITS = re.compile(
-    r"\{glue:text\}`[^`]+`|`[^`]*`|\{cite\}`[^`]+`|Seq0\d|Eq\. \d|L1\b|pix2pix|\b[23]D\b|chapter \d+"
-    r"|\b(within|beyond) \d+ m( and \d+ (deg|m))?\b"
+    r"\{glue:text\}`[^`]+`|`[^`]*`|\{cite\}`[^`]+`|Seq0\d|Eq\. \d|\bL1\b|pix2pix|\b[23]D\b"
+    r"|\b(Within|within|more than|More than|over|of starts) \d+( and \d+)? m( and \d+ deg)?\b"
 )
 
 
 @dataclass(frozen=True)
 class Claim:
-    """One block of the ledger."""
+    """One block of the page."""
 
     label: str
     number: int
@@ -45,38 +41,32 @@ class Claim:
     text: str
 
     @property
-    def place(self) -> str:
-        found = re.findall(r"^\*\*Paper\*\* \((.+?)\): ", self.text, re.MULTILINE)
-        return found[0] if len(found) == 1 else ""
-
-    @property
-    def lines(self) -> list[tuple[str, str]]:
-        return re.findall(r"^- \*\*([^*]+)\*\*: (.+)$", self.text, re.MULTILINE)
-
-    @property
-    def verdict(self) -> tuple[str, str, str]:
-        """Colour, words and what is said to it; empty where there is not exactly one verdict."""
-        found = re.findall(
-            r"^\*\*Verdict\*\*: \{bdg-(\w+)-line\}`([^`]+)`(?: (.+))?$", self.text, re.MULTILINE
-        )
+    def head(self) -> tuple[str, str, str]:
+        """Colour, outcome and place; empty where there is not exactly one such line."""
+        found = re.findall(rf"^{BADGE} \*\*Paper\*\* \((.+?)\): .+$", self.text, re.MULTILINE)
         return found[0] if len(found) == 1 else ("", "", "")
 
     @property
-    def chapters(self) -> set[str]:
-        """Chapters that the verdict sends the reader to."""
-        return set(re.findall(r"\]\(notebooks/(\w+)\.ipynb\)", self.verdict[2]))
+    def evidence(self) -> list[tuple[str, str, str]]:
+        """Letter, number of cases and finding of each line."""
+        return re.findall(r"^- \*\*([^*]+)\*\*(?: \(([^)]+)\))?: (.+)$", self.text, re.MULTILINE)
+
+    @property
+    def conclusion(self) -> str:
+        found = re.findall(r"^\*\*Conclusion\*\*: (.+)$", self.text, re.MULTILINE)
+        return found[0] if len(found) == 1 else ""
 
 
-def read_ledger() -> str:
-    return (BOOK / "claims.md").read_text(encoding="utf-8")
+def read_page(name: str) -> str:
+    return (BOOK / name).read_text(encoding="utf-8")
 
 
 def read_claims() -> list[Claim]:
-    ledger = read_ledger()
-    starts = list(BLOCK.finditer(ledger))
-    ends = [match.start() for match in starts[1:]] + [len(ledger)]
+    page = read_page("claims.md")
+    starts = list(BLOCK.finditer(page))
+    ends = [match.start() for match in starts[1:]] + [len(page)]
     return [
-        Claim(match[1], int(match[2]), match[3], ledger[match.end() : end])
+        Claim(match[1], int(match[2]), match[3], page[match.end() : end])
         for match, end in zip(starts, ends, strict=True)
     ]
 
@@ -85,91 +75,107 @@ CLAIMS = read_claims()
 each_claim = pytest.mark.parametrize("claim", CLAIMS, ids=lambda claim: claim.label)
 
 
-def test_the_ledger_holds_as_many_claims_as_the_paper_makes() -> None:
+def test_claims_are_numbered_and_each_has_a_label() -> None:
     assert 20 <= len(CLAIMS) <= 35
     assert [claim.number for claim in CLAIMS] == list(range(1, len(CLAIMS) + 1))
     assert len({claim.label for claim in CLAIMS}) == len(CLAIMS)
-    assert len(re.findall(r"^### ", read_ledger(), re.MULTILINE)) == len(CLAIMS), "a block without its label"
+    headings = re.findall(r"^### ", read_page("claims.md"), re.MULTILINE)
+    assert len(headings) == len(CLAIMS), "a block without its label"
 
 
 @each_claim
-def test_a_claim_says_where_the_paper_makes_it(claim: Claim) -> None:
-    assert claim.place, "no line `**Paper** (place): ...`, or several"
-    for part in claim.place.split("; "):
+def test_a_claim_has_an_outcome_and_its_place_in_the_paper(claim: Claim) -> None:
+    colour, outcome, place = claim.head
+    assert OUTCOMES.get(outcome) == colour
+    for part in place.split("; "):
         assert PLACE.match(part), f"no place of the paper: {part}"
 
 
 @each_claim
-def test_a_claim_has_one_of_the_four_verdicts(claim: Claim) -> None:
-    colour, words, reason = claim.verdict
-    assert words in VERDICTS
-    assert colour == COLOURS[VERDICTS[words]]
-    if words == "cannot be tested without the data set":
-        assert reason.startswith("Missing: ")
+def test_evidence_has_its_letter_and_number_of_cases(claim: Claim) -> None:
+    letters = [letter for letter, _, _ in claim.evidence]
+    assert letters and letters == sorted(letters)
+    for letter, cases, finding in claim.evidence:
+        assert letter in OURS + TEXT
+        assert (letter == TEXT) == (not cases), f"{letter}: {cases or 'no number of cases'}"
+        assert letter == TEXT or GLUED.search(finding) or LINK.search(finding), finding
 
 
 @each_claim
-def test_a_claim_leads_to_a_chapter(claim: Claim) -> None:
-    assert claim.chapters
-    assert claim.chapters <= set(CHAPTERS)
+def test_simulation_alone_supports_no_claim(claim: Claim) -> None:
+    letters = {letter for letter, _, _ in claim.evidence}
+    assert claim.head[1] != "supported" or letters - {"D"}
 
 
 @each_claim
-def test_a_line_says_what_data_it_is_from_and_rests_on_something(claim: Claim) -> None:
-    assert any(mark in OURS for mark, _ in claim.lines), "nothing of ours was said"
-    for mark, line in claim.lines:
-        assert mark in MARKS
-        if mark in OURS:
-            assert re.search(r"\{glue:text\}`|\]\(|\bnot (measured|trained|tested)\b", line), line
+def test_a_conclusion_leads_to_a_chapter(claim: Claim) -> None:
+    chapters = set(re.findall(r"\]\(notebooks/(\w+)\.ipynb\)", claim.conclusion))
+    assert chapters and chapters <= set(CHAPTERS)
 
 
 @each_claim
 def test_no_number_of_ours_is_typed(claim: Claim) -> None:
-    lines = [line for mark, line in claim.lines if mark in OURS] + [claim.verdict[2]]
+    lines = [finding for letter, _, finding in claim.evidence if letter in OURS] + [claim.conclusion]
     typed = [line for line in lines if re.search(r"\d", NAMES_AND_LIMITS.sub("", LINK.sub("", line)))]
     assert not typed
 
 
 @each_claim
-def test_a_block_holds_nothing_besides_its_parts(claim: Claim) -> None:
+def test_a_block_contains_nothing_but_its_parts(claim: Claim) -> None:
     """A line that is neither would escape the rules above; a heading of the next group may follow."""
     for line in claim.text.strip().splitlines():
-        assert not line or re.match(r"\*\*(Paper|Verdict)\*\*|- \*\*[^*]+\*\*: |## ", line), line
+        assert not line or re.match(r"\{bdg-|\*\*Conclusion\*\*: |- \*\*[A-Z]\*\*|## ", line), line
 
 
-def test_the_table_on_top_agrees_with_the_blocks() -> None:
-    rows = re.findall(
-        r"^\| \[(\d+)\]\((claim-[\w-]+)\) \| (.+) \| \{bdg-(\w+)-line\}`([^`]+)` \|$",
-        read_ledger(),
-        re.MULTILINE,
-    )
-    told = [(int(number), *row) for number, *row in rows]
-    assert told == [
-        (claim.number, claim.label, claim.title, claim.verdict[0], VERDICTS[claim.verdict[1]])
-        for claim in CLAIMS
+def test_the_table_agrees_with_the_blocks() -> None:
+    pattern = rf"^\| \[(\d+)\]\((claim-[\w-]+)\) \| (.+?) \| {BADGE} \| (.+?) \| (.+) \|$"
+    rows = re.findall(pattern, read_page("claims.md"), re.MULTILINE)
+    assert [(int(row[0]), *row[1:5]) for row in rows] == [
+        (claim.number, claim.label, claim.title, *claim.head[:2]) for claim in CLAIMS
     ]
+    for row, claim in zip(rows, CLAIMS, strict=True):
+        kinds = [kind.partition("&nbsp;") for kind in row[5].split("; ")]
+        assert [letter for letter, _, _ in kinds] == [letter for letter, _, _ in claim.evidence]
+        for (_, _, cases), (_, told, _) in zip(kinds, claim.evidence, strict=True):
+            assert [m[0] for m in GLUED.finditer(cases)] == [m[0] for m in GLUED.finditer(told)], claim.label
+        assert 0 < len(row[6].split()) <= 16, f"reason of {claim.label}"
 
 
 def test_the_counts_on_top_agree_with_the_blocks() -> None:
-    counted = re.search(
-        r"^Of (\d+) claims, \*\*(\d+)\*\* are reproduced, \*\*(\d+)\*\* reproduced in part, "
-        r"\*\*(\d+)\*\* contradicted, and \*\*(\d+)\*\* cannot be tested without the data set\.$",
-        read_ledger(),
-        re.MULTILINE,
+    words = r"Of (\d+) claims, \*\*(\d+)\*\* are supported" + "".join(
+        rf",(?: and)? \*\*(\d+)\*\* {outcome}" for outcome in list(OUTCOMES)[1:]
     )
-    verdicts = [claim.verdict[1] for claim in CLAIMS]
+    counted = re.search(words, read_page("claims.md"))
+    outcomes = [claim.head[1] for claim in CLAIMS]
     assert counted
-    assert [int(number) for number in counted.groups()] == [
-        len(CLAIMS),
-        *(verdicts.count(verdict) for verdict in VERDICTS),
-    ]
+    assert [int(n) for n in counted.groups()] == [len(CLAIMS), *(outcomes.count(name) for name in OUTCOMES)]
 
 
-def test_every_choice_is_told_whole() -> None:
-    """What was chosen, and for the paper's own open points also how much it matters, or that nobody knows."""
-    page = (BOOK / "choices.md").read_text(encoding="utf-8")
-    items = re.findall(r"^([^\s:#].+)\n((?:: .+\n?)+)", page, re.MULTILINE)
-    assert len(items) > 40
-    for term, told in items:
-        assert told.startswith(": **Chosen:** "), term
-        assert re.search(r"^: \*\*(Why|Matters):\*\* ", told, re.MULTILINE), term
+def test_links_to_a_claim_have_its_number() -> None:
+    numbers = {claim.label: claim.number for claim in CLAIMS}
+    pages = read_page("claims.md") + read_page("choices.md")
+    for number, label in re.findall(r"\[claim (\d+)\]\((claim-[\w-]+)\)", pages):
+        assert numbers.get(label) == int(number), label
+    assert set(re.findall(r"\]\((claim-[\w-]+)\)", pages)) <= set(numbers)
+
+
+def test_every_choice_has_a_reason_and_an_effect() -> None:
+    """The effect is a number of a chapter with its evidence, a page that shows it, or said to be not measured."""
+    rows = re.findall(
+        r"^\| \[\d+\]\(notebooks/\w+\.ipynb\) \| (.+) \|$", read_page("choices.md"), re.MULTILINE
+    )
+    assert len(rows) > 40
+    for row in rows:
+        cells = row.split(" | ")
+        assert len(cells) == 4 and all(cells), row
+        if GLUED.search(cells[3]):
+            assert re.search(r"\([A-D]\b", cells[3]), f"no evidence: {row}"
+        else:
+            assert re.search(r"not measured|\]\(notebooks/", cells[3], re.IGNORECASE), row
+
+
+@pytest.mark.parametrize("page", ["claims.md", "choices.md", "intro.md"])
+def test_numbers_come_from_chapters_that_exist(page: str) -> None:
+    roles = re.findall(r"\{glue:text\}`[^`]*`", read_page(page))
+    assert roles and all(GLUED.fullmatch(role) for role in roles)
+    assert {GLUED.fullmatch(role)[1] for role in roles} <= set(CHAPTERS)
