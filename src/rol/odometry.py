@@ -283,10 +283,12 @@ def _sort(points):
         u, v = cell_index(points[k, 0]), cell_index(points[k, 1])
         cells[k] = (u & (width - 1)) * width + (v & (width - 1))
         starts[cells[k] + 2] += 1
-    # Entry c + 1 is the start of cell c, and its end once its points are in place: no copy of a large array.
-    starts, found = np.cumsum(starts), np.empty_like(points)
+    # Summed in place, since the array is large for a large map.
+    for cell in range(2, len(starts)):
+        starts[cell] += starts[cell - 1]
+    found = np.empty_like(points)
     for k in range(len(points)):
-        found[starts[cells[k] + 1]] = points[k]
+        found[starts[cells[k] + 1]] = points[k]  # entry c + 1: start of cell c, its end when all are placed
         starts[cells[k] + 1] += 1
     return found, starts[:-1]
 

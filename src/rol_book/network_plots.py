@@ -97,8 +97,9 @@ def draw_network(ax: Axes, layers: list[Layer], title: str = "") -> Axes:
     ax : Axes
         The axes.
     """
+    right = 0.0
     for place, layer in enumerate(layers):
-        tall = 0.5 + 0.5 * np.log2(layer.height / 16) / np.log2(512 / 16)
+        tall = 0.2 + 0.8 * np.log2(max(layer.height, 16) / 16) / np.log2(512 / 16)
         wide = 0.10 + 0.09 * np.log2(layer.channels)
         copies = min(layer.repeats, 3)  # a stack of boxes stands for several layers
         for copy in reversed(range(copies)):
@@ -106,7 +107,9 @@ def draw_network(ax: Axes, layers: list[Layer], title: str = "") -> Axes:
             box = Rectangle(corner, wide, tall, facecolor=KIND_COLOURS[layer.kind], edgecolor="#333333")
             ax.add_patch(box)
         if place:
-            ax.annotate("", (place - wide / 2, 0), (place - 0.5, 0), arrowprops={"arrowstyle": "->"})
+            arrow = {"arrowstyle": "->", "shrinkA": 4, "shrinkB": 2}
+            ax.annotate("", (place - wide / 2, 0.0), (right, 0.0), arrowprops=arrow)
+        right = place + wide / 2 + 0.05 * (copies - 1)
         name = f"{layer.repeats} x {layer.label}" if layer.repeats > 1 else layer.label
         ax.text(place, 0.62, name, ha="center", va="bottom", fontsize=9.5)
         shape = f"{layer.channels} ch.\n{layer.height} x {layer.width}"

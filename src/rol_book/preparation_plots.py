@@ -243,7 +243,7 @@ def draw_removal(
     ax.axvline(min_height, color="black", linestyle="--", label="threshold in use")
     ax.set(xlabel="threshold, z in the radar frame [m]", ylabel="points removed [%]")
     ax.set(xlim=thresholds[[0, -1]], ylim=(0, 102))
-    ax.legend(loc="center right")
+    ax.legend(loc="upper right", bbox_to_anchor=(1.0, 0.94))
     return ax
 
 
@@ -325,7 +325,8 @@ def draw_split(ax: Axes, path: np.ndarray, parts: Mapping[str, np.ndarray]) -> A
     plots.draw_track(ax, path, colour=COLOURS["map"], label="not used", linewidth=1.0)
     for (name, is_part), colour in zip(parts.items(), ("fake", "real"), strict=True):
         plots.show_points(ax, path[is_part, :2], colour=COLOURS[colour], size=14, label=name)
-    ax.legend(loc="upper left", bbox_to_anchor=(1.02, 1.0), markerscale=1.6)
+    ax.set_aspect("equal", adjustable="datalim")
+    ax.legend(loc="best", markerscale=1.6)
     return ax
 
 
@@ -360,7 +361,8 @@ def draw_map_with_scan(
     plots.show_points(ax, placed, colour=COLOURS["real"], size=1.4, label="one scan")
     plots.draw_track(ax, poses, colour=COLOURS["truth"], label="path")
     plots.show_poses(ax, pose[None], colour=COLOURS["truth"], length=9.0)
-    ax.legend(loc="upper left", bbox_to_anchor=(1.02, 1.0), markerscale=5)
+    ax.set_aspect("equal", adjustable="datalim")
+    ax.legend(loc="upper right", markerscale=5)
     return ax
 
 
