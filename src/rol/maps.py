@@ -199,9 +199,8 @@ def register_maps(
         result = icp_2d(near, thin_points(target, cell)[0], pose, settings)
         pose, converged = result.T_target_source, result.converged
         done.append((reach, max_distance, result.rmse_m, pose))
-    distances = cKDTree(target).query(transform_points(pose, source))[0]
-    fraction_1m, median_m = float(np.mean(distances < 1.0)), float(np.median(distances))
-    return Registration(pose, fraction_1m, median_m, converged, tuple(done))
+    near_m = cKDTree(target).query(transform_points(pose, source))[0]
+    return Registration(pose, float(np.mean(near_m < 1.0)), float(np.median(near_m)), converged, tuple(done))
 
 
 def to_first_map(T_map_session: np.ndarray, poses: np.ndarray) -> np.ndarray:

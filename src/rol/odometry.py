@@ -278,17 +278,19 @@ def _sort(points):
     width = 8
     while width * width < 4 * len(points):
         width *= 2
-    cells, starts = np.empty(len(points), np.int64), np.zeros(width * width + 1, np.int64)
+    cells, starts = np.empty(len(points), np.int64), np.zeros(width * width + 2, np.int64)
     for k in range(len(points)):
         u, v = cell_index(points[k, 0]), cell_index(points[k, 1])
         cells[k] = (u & (width - 1)) * width + (v & (width - 1))
-        starts[cells[k] + 1] += 1
-    starts = np.cumsum(starts)
-    free, found = starts.copy(), np.empty_like(points)
+        starts[cells[k] + 2] += 1
+    # Summed in place, since the array is large for a large map.
+    for cell in range(2, len(starts)):
+        starts[cell] += starts[cell - 1]
+    found = np.empty_like(points)
     for k in range(len(points)):
-        found[free[cells[k]]] = points[k]
-        free[cells[k]] += 1
-    return found, starts
+        found[starts[cells[k] + 1]] = points[k]  # entry c + 1: start of cell c, its end when all are placed
+        starts[cells[k] + 1] += 1
+    return found, starts[:-1]
 
 
 @compiled

@@ -7,8 +7,14 @@ farther out.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import cv2
 import numpy as np
+import pandas as pd
+
+from rol.oxford import Session
+from rol.pairs import AlignedScan, PairSettings, build_pair
 
 
 def measure_misalignment(
@@ -143,6 +149,51 @@ def best_shifts(shifts: np.ndarray, table: np.ndarray) -> np.ndarray:
         if 0 < j < len(row) - 1 and row[j] > row.min():
             best[i] = shifts[j] + _vertex(row[j - 1 : j + 2]) * (shifts[1] - shifts[0])
     return best
+
+
+def measure_pairs(
+    session: Session,
+    alignments: Mapping[str, pd.DataFrame],
+    settings: Mapping[str, PairSettings],
+    band_edges_m: np.ndarray,
+    max_shift_px: int = 16,
+) -> tuple[pd.DataFrame, dict[str, np.ndarray]]:
+    """Measure the misalignment of the pairs of a session under several settings.
+
+    Parameters
+    ----------
+    session : Session
+        The session.
+    alignments : mapping of str to DataFrame
+        Motion of `rol.pairs.PairSettings` -> scans to measure, rows of `rol.pairs.align_scans`.
+    settings : mapping of str to PairSettings
+        Settings to compare, by name.
+    band_edges_m : array, shape (k + 1,)
+        Edges of range bands, increasing [m].
+    max_shift_px : int
+        Largest shift looked for in each direction [pixels].
+
+    Returns
+    -------
+    shifts : DataFrame
+        One row per setting and scan: ``option``, ``speed_mps``, ``drow``, ``dcol`` and ``shift_px``, the
+        length of the shift; nan where no shift is found.
+    radial_m : dict of array, shape (k,)
+        Per motion-compensated setting the shift of the radar outwards in each range band [m].
+    """
+    rows, radial_m = [], {}
+    for name, setting in settings.items():
+        table = 0.0
+        for _, line in alignments[setting.motion].iterrows():
+            pair = build_pair(session, AlignedScan.from_row(line), setting)
+            drow, dcol = measure_misalignment(*pair, max_shift_px=max_shift_px)
+            rows.append((name, np.hypot(line.vx_mps, line.vy_mps), drow, dcol, np.hypot(drow, dcol)))
+            if setting.motion == "corrected":
+                shifts_m, sums = correlate_ranges(*pair, band_edges_m)
+                table = table + sums
+        if setting.motion == "corrected":
+            radial_m[name] = best_shifts(shifts_m, table)
+    return pd.DataFrame(rows, columns=["option", "speed_mps", "drow", "dcol", "shift_px"]), radial_m
 
 
 def _vertex(three: np.ndarray) -> float:

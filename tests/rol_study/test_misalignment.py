@@ -2,8 +2,11 @@
 
 import cv2
 import numpy as np
+import pandas as pd
 import pytest
 
+from rol.pairs import PairSettings
+from rol_study import misalignment
 from rol_study.misalignment import best_shifts, correlate_images, correlate_ranges, measure_misalignment
 
 
@@ -89,3 +92,30 @@ def test_best_shifts_by_hand():
     shifts = np.array([-1.0, 0.0, 1.0, 2.0])
     table = np.array([[0.0, 3.0, 4.0, 3.0], [0.0, 4.0, 4.0, 0.0], [1.0, 1.0, 1.0, 1.0], [9.0, 1.0, 0.0, 0.0]])
     np.testing.assert_allclose(best_shifts(shifts, table), [1.0, 0.5, np.nan, np.nan])
+
+
+def test_pairs_are_measured_under_each_setting(monkeypatch):
+    lines = pd.DataFrame(
+        {"radar_stamp_us": [1, 2], "mid_stamp_us": [1, 2], "left_stamp_us": [1, 2]}
+        | {"vx_mps": [3.0, 0.0], "vy_mps": [4.0, 0.0], "yaw_rate_radps": [0.0, 0.0]}
+    )
+    built = []
+
+    def build_pair(session, scan, setting):
+        built.append((session, scan.radar_stamp_us, setting.motion))
+        image = street(scan.radar_stamp_us)
+        return blur(image, 3.0 if setting.motion == "none" else 0.0), image
+
+    monkeypatch.setattr(misalignment, "build_pair", build_pair)
+    settings = {"as is": PairSettings("none"), "compensated": PairSettings("corrected")}
+    edges = np.array([5.0, 20.0, 40.0])
+    found, radial_m = misalignment.measure_pairs(
+        "session", {"none": lines, "corrected": lines[:1]}, settings, edges
+    )
+    assert built == [("session", 1, "none"), ("session", 2, "none"), ("session", 1, "corrected")]
+    assert found.option.tolist() == ["as is", "as is", "compensated"]
+    np.testing.assert_allclose(found.speed_mps, [5.0, 0.0, 5.0])
+    np.testing.assert_allclose(found.drow, [3.0, 3.0, 0.0], atol=0.12)
+    np.testing.assert_allclose(found.shift_px, np.hypot(found.drow, found.dcol))
+    assert list(radial_m) == ["compensated"]  # only these can be compared along range
+    np.testing.assert_allclose(radial_m["compensated"], 0.0, atol=0.1)
