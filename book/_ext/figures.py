@@ -38,6 +38,7 @@ class NumberTables(SphinxTransform):
                 table = TableFigure(figure.rawsource, *figure.children, **figure.attributes)
                 table.source, table.line, table.document = figure.source, figure.line, self.document
                 figure.replace_self(table)
+                self.document.ids |= dict.fromkeys(table["ids"], table)  # numbers are looked up here
 
 
 def caption_of(node: nodes.Node) -> str | None:

@@ -61,7 +61,9 @@ def test_figure_of_a_table_is_a_table(figures: ModuleType) -> None:
     document = new_document("page")
     for name in ("tab-a", "fig-a"):
         document += nodes.figure("", nodes.caption("", f"Words of {name}."), names=[name])
+        document.note_explicit_target(document[-1])
     figures.NumberTables(document).apply()
     kinds = [type(node) for node in document.findall(nodes.figure)]
     assert kinds == [figures.TableFigure, nodes.figure]
     assert figures.caption_of(document[0]) == "Words of tab-a."
+    assert document.ids["tab-a"] is document[0] and document.ids["fig-a"] is document[1]
