@@ -15,7 +15,7 @@ def glue_numbers(values: Mapping[str, Any] | None = None, /, **more: Any) -> Non
     Parameters
     ----------
     values, **more
-        Values by name: numbers, NumPy scalars or strings. In the text, ``{glue:text}`name:.2f` `` shows one.
+        Values by name: numbers, NumPy scalars or strings. The role ``glue:text`` shows one, as ``name:.2f``.
 
     Raises
     ------
