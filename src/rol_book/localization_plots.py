@@ -245,16 +245,19 @@ def draw_error_cdfs(
         for ax, values in zip(axes, (positions, headings), strict=True):
             for one in values:
                 _draw_cdf(ax, one, METHOD_COLOURS[method], linewidth=0.7, alpha=0.6)
-            _draw_cdf(ax, np.concatenate(values), METHOD_COLOURS[method], label=method, linewidth=2.4)
+            _draw_cdf(
+                ax, np.concatenate(values), METHOD_COLOURS[method], label=f"method {method}", linewidth=2.4
+            )
     for ax, limits in zip(axes, np.transpose(CLASSES), strict=True):
         for number, values in enumerate(published.values()):
-            label = "" if number else "paper's Table III"
+            label = "" if number else "published (Table III)"
             ax.plot(limits, values, "o", color="#000000", markerfacecolor="white", label=label, zorder=4)
-        ax.set(xscale="log", xlim=(min_m, 20.0), ylim=(0, 103))
+        ax.set(xscale="log", xlim=(min_m, 20.0), ylim=(0, 103), ylabel="scans below the error [%]")
+        ax.xaxis.set_major_formatter("{x:g}")
+        ax.tick_params(labelleft=True)
         ax.legend(loc="upper left")
-    axes[0].set(xlabel="position error [m]", ylabel="scans below the error [%]")
-    axes[1].set(xlabel="heading error [deg]")
-    axes[1].tick_params(labelleft=True)
+    axes[0].set_xlabel("position error [m]")
+    axes[1].set_xlabel("heading error [deg]")
     return figure
 
 
