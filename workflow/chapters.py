@@ -52,7 +52,7 @@ LISTS, FOLDERS = ("sessions", "methods"), ("sessions_root", "out_dir", "book_dir
 CONFIG_KEYS = {"profile", *LISTS, *FOLDERS, "seed", "notebooks", "simulated"}
 OPTIONAL_KEYS = {"real_root"}
 # Keys that are parameters of notebooks.
-SHARED = ("sessions_root", "sessions", "out_dir", "seed", "real_root")
+SHARED = ("sessions_root", "sessions", "methods", "out_dir", "seed", "real_root")
 
 
 class ChapterError(ValueError):

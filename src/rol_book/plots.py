@@ -447,55 +447,6 @@ def show_poses(
     )
 
 
-def draw_result_row(
-    axes: Sequence[Axes],
-    truth: np.ndarray,
-    estimate: np.ndarray,
-    position_m: np.ndarray,
-    yaw_deg: np.ndarray,
-    *,
-    max_m: float = 5.0,
-    max_deg: float = 5.0,
-) -> Sequence[Axes]:
-    """Draw one row of the paper's Fig. 4: paths, position errors, heading errors.
-
-    Parameters
-    ----------
-    axes : sequence of three Axes
-        Where to draw.
-    truth, estimate : array, shape (n, 3)
-        Poses in the map [m, m, rad].
-    position_m, yaw_deg : array, shape (n,)
-        Errors of the position [m] and of the heading [deg].
-    max_m, max_deg : float
-        Ends of the histograms; larger errors are counted in the last bin.
-
-    Returns
-    -------
-    axes : sequence of three Axes
-        The axes.
-    """
-    draw_track(axes[0], truth, colour=COLOURS["truth"], label="ground truth", linewidth=2.6)
-    draw_track(axes[0], estimate, colour=COLOURS["estimate"], label="estimate", linewidth=1.1)
-    axes[0].legend(loc="best", fontsize=8.5)
-    share = 100.0 / len(position_m)
-    axes[1].hist(
-        np.clip(position_m, 0.0, max_m),
-        np.linspace(0.0, max_m, 26),
-        weights=np.full(len(position_m), share),
-        color=COLOURS["estimate"],
-    )
-    axes[1].set(xlabel="position error [m]", ylabel="scans [%]", xlim=(0.0, max_m))
-    axes[2].hist(
-        np.clip(yaw_deg, -max_deg, max_deg),
-        np.linspace(-max_deg, max_deg, 41),
-        weights=np.full(len(yaw_deg), share),
-        color=COLOURS["real"],
-    )
-    axes[2].set(xlabel="heading error [deg]", ylabel="scans [%]", xlim=(-max_deg, max_deg))
-    return axes
-
-
 # ---- the network ----
 
 
