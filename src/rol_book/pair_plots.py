@@ -188,17 +188,23 @@ def draw_cases(
     """
     widths = (1, 1, 1, 1, 1.15)
     figure, axes = plots.subplots(
-        len(cases), 5, height=0.3 + 1.72 * len(cases), squeeze=False, width_ratios=widths, sharex="col"
+        len(cases),
+        5,
+        height=0.3 + 1.72 * len(cases),
+        squeeze=False,
+        width_ratios=widths,
+        sharex="col",
+        sharey="col",
     )
     edges = np.arange(0.0, max_m + 0.01, 0.25)
     for row, (pair, generated, points) in zip(axes, cases, strict=True):
         plots.show_image(row[0], np.maximum(pair.radar_image, NOISE) - NOISE, vmax=90)
         plots.show_image(row[1], generated, vmax=255)
         plots.show_image(row[2], pair.lidar_image)
-        plots.show_points(row[3], pair.lidar_points, colour="#9A9A9A", size=1.0)
-        plots.show_points(row[3], points, colour=COLOURS["fake"], size=2.5)
+        plots.show_points(row[3], pair.lidar_points, colour="#A5A5A5", size=0.8)
+        plots.show_points(row[3], points, colour=COLOURS["fake"], size=1.8)
         counts = distance_histogram(nn_distances(points, pair.lidar_points), edges)
-        plots.draw_distances(row[4], counts, edges).set(xlabel="", ylabel="", ylim=(0, 50))
+        plots.draw_distances(row[4], counts, edges).set(xlabel="", ylabel="")
         for ax in row[:4]:
             plots.zoom(ax, (0.0, 0.0), half)
             ax.set(xticks=[], yticks=[], xlabel="", ylabel="")
@@ -227,7 +233,7 @@ def draw_distance_curves(
     figure : Figure
     """
     figure, axes = plots.subplots(1, len(distances), height=3.6, sharey=True, squeeze=False)
-    levels = np.arange(0.0, 5.01, 0.1)
+    levels = np.arange(0.0, 5.01, 0.25)
     for ax, (title, by_front) in zip(axes[0], distances.items(), strict=True):
         for name, away in by_front.items():
             below = [100 * np.mean(away < level) for level in levels]
@@ -264,7 +270,7 @@ def draw_kinds(points: np.ndarray, kinds: pd.DataFrame, lidar: np.ndarray) -> Fi
         "over 2 m, hidden from the lidar": (is_far & kinds.is_hidden, "real"),
         "over 2 m, in view": (is_far & ~kinds.is_hidden, "estimate"),
     }
-    plots.show_points(ax, lidar, colour="#B5B5B5", size=1.0, label="real lidar")
+    plots.show_points(ax, lidar, colour="#A5A5A5", size=2.0, label="real lidar")
     for label, (is_kind, colour) in groups.items():
         some = points[is_kind.to_numpy()]
         plots.show_points(ax, some, colour=COLOURS[colour], size=7.0, label=label)

@@ -528,7 +528,7 @@ def tabulate_turns(turns: Mapping[int, tuple[pd.DataFrame, Any]], labels: Mappin
         One row per scan, variant and front end, the precision in percent.
     """
     table = pd.concat({stamp: found for stamp, (found, _) in turns.items()})
-    table = table.rename_axis(["scan", "azimuths", "points"]).reset_index()
+    table = table.rename_axis(["scan", "variant", "points"]).reset_index()
     table[["share_1m", "share_2m"]] *= 100
     table["points"] = table["points"].map(labels)
     names = ["within 1 m [%]", "within 2 m [%]", "median [m]", "median [deg]", "worst [m]"]

@@ -124,7 +124,7 @@ def test_error_of_a_calibration_is_given_by_range() -> None:
     walls = pd.DataFrame({"range_m": [5.0, 6.0, 45.0], "bin": [123.5, 148.5, 1123.5]})
     table = evaluate_ranges(walls, {"ours": RangeCalibration(0.04, 0.0)})
     assert table.range_m.tolist() == [5.5, 45.0]
-    assert table.ours.tolist() == pytest.approx([-0.03, -0.04])
+    assert table.ours.tolist() == pytest.approx([-0.04, -0.04])
 
 
 def test_without_pairs_there_is_no_calibration() -> None:
