@@ -54,11 +54,11 @@ def draw_story(
     figure : Figure
     """
     n = len(images) + 1
-    figure, axes = plots.subplots(1, n, height=plots.WIDTH / n + 0.15)
+    figure, axes = plots.subplots(1, n, height=plots.WIDTH / n + 0.3)
     for k, (name, image) in enumerate(images.items()):
         plots.show_image(axes[k], clean(image) if k == 0 else image, vmax=75 if k == 0 else None, title=name)
     plots.show_points(axes[-1], crop(around, np.zeros(2), half), colour="#9A9A9A", size=1.5, title=title)
-    plots.show_points(axes[-1], crop(points, np.zeros(2), half), colour=COLOURS["fake"], size=5.0)
+    plots.show_points(axes[-1], crop(points, np.zeros(2), half), colour=COLOURS["fake"], size=4.0)
     plots.show_poses(axes[-1], np.zeros((1, 3)), length=0.2 * half)
     for ax in axes:
         plots.zoom(ax, (0.0, 0.0), half)
@@ -99,7 +99,7 @@ def draw_scans_on_map(
     figure : Figure
     """
     n = len(placed)
-    figure, axes = plots.subplots(1, n, height=plots.WIDTH / n + 0.15, squeeze=False)
+    figure, axes = plots.subplots(1, n, height=plots.WIDTH / n + 0.3, squeeze=False)
     for ax, points, pose, title in zip(axes[0], placed, poses, titles, strict=True):
         away = map_tree.query(points)[0]
         plots.show_points(ax, crop(map_points, pose, half), colour="#B5B5B5", size=0.8, title=title)
@@ -312,6 +312,7 @@ def draw_submap(
         axes.legend(loc="upper left", markerscale=4, frameon=True)
     last.plot(sharpness[0], sharpness[1] / 1000.0, "o-", color=COLOURS["real"])
     last.axvline(0.0, color="#444444", linewidth=0.9, linestyle="--")
+    last.set_box_aspect(1.0)
     last.set(title="sharpness", xlabel="rotation of sweeps [deg]", ylabel="occupied cells [1000]")
     return figure
 
