@@ -142,7 +142,7 @@ def draw_range_errors(table: pd.DataFrame) -> Figure:
     """Draw the distance of walls beyond their lidar points over range, see
     `rol_study.real_calibration.evaluate_ranges`."""
     figure, ax = plots.subplots(height=3.3)
-    for name, colour in zip(table.columns.drop("range_m"), ("estimate", "real", "fake"), strict=True):
+    for name, colour in zip(table.columns.drop("range_m"), ("estimate", "real", "fake"), strict=False):
         ax.plot(table.range_m, table[name], "o-", color=COLOURS[colour], label=name)
     ax.axhline(0.0, color=GREY, linewidth=0.8)
     ax.set(xlabel="range [m]", ylabel="radar beyond lidar [m]")
