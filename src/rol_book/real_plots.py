@@ -59,7 +59,7 @@ def draw_story(
         plots.show_image(axes[k], clean(image) if k == 0 else image, vmax=75 if k == 0 else None, title=name)
     plots.show_points(axes[-1], crop(around, np.zeros(2), half), colour="#9A9A9A", size=1.5, title=title)
     plots.show_points(axes[-1], crop(points, np.zeros(2), half), colour=COLOURS["fake"], size=4.0)
-    plots.show_poses(axes[-1], np.zeros((1, 3)), length=0.2 * half)
+    plots.show_poses(axes[-1], np.zeros((1, 3)), length=0.3 * half)
     for ax in axes:
         plots.zoom(ax, (0.0, 0.0), half)
         ax.set(xticks=[], yticks=[], xlabel="", ylabel="")
