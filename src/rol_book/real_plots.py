@@ -10,8 +10,6 @@ import numpy as np
 from matplotlib.figure import Figure
 from scipy.spatial import cKDTree
 
-from rol.geometry import transform_points
-from rol.similarity import distance_histogram
 from rol_book import plots
 from rol_book.plots import COLOURS
 
@@ -28,73 +26,88 @@ def crop(points: np.ndarray, centre: np.ndarray, half: float) -> np.ndarray:
     return points[np.abs(points - centre[:2]).max(axis=1) < half]
 
 
-def draw_scan_on_map(
-    result: Sequence[np.ndarray],
-    pose: np.ndarray,
-    map_points: np.ndarray,
-    titles: Sequence[str],
+def draw_story(
+    images: Mapping[str, np.ndarray],
+    points: np.ndarray,
+    around: np.ndarray,
+    title: str,
     *,
-    half: float = 55.0,
-    arrow: str = "truth",
+    half: float = 40.0,
 ) -> Figure:
-    """Draw a radar scan, the generated image, and the generated points on a map at a pose.
+    """Draw one scan from left to right: images, and its points on a map, all in the frame of the vehicle.
 
     Parameters
     ----------
-    result : points, radar image, generated image
-        As `rol_beyond.front_ends.generate_points` returns them.
-    pose : array, shape (3,)
-        Pose T_map_radar [m, m, rad].
-    map_points : array, shape (m, 2)
-        Points of the map [m].
-    titles : sequence of three str
-        Titles.
+    images : mapping of str to array, shape (w, w), uint8
+        Title -> image; the first one is the radar's.
+    points : array, shape (n, 2)
+        Points of the scan [m].
+    around : array, shape (m, 2)
+        Points of the map in the frame of the vehicle [m].
+    title : str
+        Title of the last panel.
     half : float
-        Half the edge of the square shown [m].
-    arrow : str
-        Colour of the pose, a name of ``rol_book.plots.COLOURS``.
+        Half the edge of the squares shown [m].
 
     Returns
     -------
     figure : Figure
     """
-    points, radar_image, generated = result
-    figure, axes = plt.subplots(1, 3, figsize=(9.6, 3.5), dpi=90)
-    plots.show_image(axes[0], clean(radar_image), vmax=90, title=titles[0])
-    plots.show_image(axes[1], generated, title=titles[1])
-    around = crop(map_points, pose, 1.3 * half)
-    plots.show_points(axes[2], around, colour=COLOURS["map"], size=0.5, title=titles[2])
-    plots.show_points(axes[2], transform_points(pose, points), colour=COLOURS["fake"], size=3.0)
-    plots.show_poses(axes[2], pose[None], colour=COLOURS[arrow], length=0.15 * half)
-    for ax, centre in zip(axes, ((0.0, 0.0), (0.0, 0.0), pose[:2]), strict=True):
-        plots.zoom(ax, centre, half)
-    for ax in axes[1:]:
-        ax.set_ylabel("")
+    n = len(images) + 1
+    figure, axes = plots.subplots(1, n, height=plots.WIDTH / n + 0.3)
+    for k, (name, image) in enumerate(images.items()):
+        plots.show_image(axes[k], clean(image) if k == 0 else image, vmax=75 if k == 0 else None, title=name)
+    plots.show_points(axes[-1], crop(around, np.zeros(2), half), colour="#9A9A9A", size=1.5, title=title)
+    plots.show_points(axes[-1], crop(points, np.zeros(2), half), colour=COLOURS["fake"], size=4.0)
+    plots.show_poses(axes[-1], np.zeros((1, 3)), length=0.3 * half)
+    for ax in axes:
+        plots.zoom(ax, (0.0, 0.0), half)
+        ax.set(xticks=[], yticks=[], xlabel="", ylabel="")
+        ax.spines[:].set_visible(True)
+        ax.spines[:].set_color("#9A9A9A")
     return figure
 
 
-def draw_precision(table: Any, names: Mapping[str, str]) -> Figure:
-    """Draw the precision of each scan's points by front end.
+def draw_scans_on_map(
+    placed: Sequence[np.ndarray],
+    poses: np.ndarray,
+    titles: Sequence[str],
+    map_points: np.ndarray,
+    map_tree: cKDTree,
+    *,
+    half: float = 50.0,
+) -> Figure:
+    """Draw the points of scans on a map side by side, in colours for near the map and away from it.
 
     Parameters
     ----------
-    table : pandas.DataFrame
-        ``points``, ``share_1m``, ``share_2m``: one row per scan and front end.
-    names : mapping of str to str
-        Front end -> name under the column.
+    placed : sequence of array, shape (n, 2)
+        Points on the map [m], one cloud per scan.
+    poses : array, shape (k, 3)
+        Poses of the scans [m, m, rad].
+    titles : sequence of str
+        Titles.
+    map_points : array, shape (m, 2)
+        Points of the map [m].
+    map_tree : scipy.spatial.cKDTree
+        Their tree.
+    half : float
+        Half the edge of the squares shown [m].
 
     Returns
     -------
     figure : Figure
     """
-    figure, axes = plt.subplots(1, 2, figsize=(9.8, 3.6), sharey=True)
-    fronts = list(dict.fromkeys(table["points"]))
-    for ax, radius in zip(axes, (1, 2), strict=True):
-        values = [100 * table[f"share_{radius}m"][table["points"] == front].to_numpy() for front in fronts]
-        plots.draw_dots(ax, values, [names.get(front, front) for front in fronts], colour=COLOURS["fake"])
-        ax.set(title=f"within {radius} m", ylim=(0, 100))
-        ax.tick_params(axis="x", labelsize=7.5)
-    axes[0].set_ylabel("points near the map [%]")
+    n = len(placed)
+    figure, axes = plots.subplots(1, n, height=plots.WIDTH / n + 0.3, squeeze=False)
+    for ax, points, pose, title in zip(axes[0], placed, poses, titles, strict=True):
+        away = map_tree.query(points)[0]
+        plots.show_points(ax, crop(map_points, pose, half), colour="#B5B5B5", size=0.8, title=title)
+        plots.show_points(ax, points[away < 1.0], colour=COLOURS["fake"], size=3.5)
+        plots.show_points(ax, points[away >= 1.0], colour=COLOURS["estimate"], size=3.5)
+        plots.zoom(ax, pose[:2], half)
+        ax.set(xticks=[], yticks=[], xlabel="", ylabel="")
+        ax.spines[:].set_visible(True)
     return figure
 
 
@@ -114,7 +127,7 @@ def draw_thresholds(table: Any, used: float) -> Figure:
     """
     by_level = table.groupby("level")
     levels = np.array(sorted(by_level.groups))
-    figure, axes = plt.subplots(1, 2, figsize=(9, 3.2))
+    figure, axes = plots.subplots(1, 2, height=3.3)
     lines = (
         (axes[0], by_level.n, 1, "o", "fake", ""),
         (axes[1], by_level.share_1m, 100, "o", "fake", "within 1 m"),
@@ -130,56 +143,6 @@ def draw_thresholds(table: Any, used: float) -> Figure:
     for ax in axes:
         ax.axvline(used, color="#444444", linewidth=0.9)
         ax.set_xlabel("threshold on the grey value")
-    return figure
-
-
-def draw_scans_as_in_paper(
-    results: Sequence[Sequence[np.ndarray]],
-    poses: np.ndarray,
-    labels: Sequence[str],
-    map_points: np.ndarray,
-    map_tree: cKDTree,
-) -> Figure:
-    """Draw scans in rows as in the paper's Fig. 3: radar, generated image, points on the map, distances.
-
-    Parameters
-    ----------
-    results : sequence of (points, radar image, generated image)
-        One per scan.
-    poses : array, shape (n, 3)
-        Their poses on the map [m, m, rad].
-    labels : sequence of str
-        Labels of the rows.
-    map_points : array, shape (m, 2)
-        Points of the map [m].
-    map_tree : scipy.spatial.cKDTree
-        Their tree.
-
-    Returns
-    -------
-    figure : Figure
-    """
-    edges = np.arange(0.0, 10.01, 0.25)
-    size, widths = (9.6, 2.3 * len(results)), (1, 1, 1, 1.15)
-    figure, axes = plt.subplots(len(results), 4, figsize=size, width_ratios=widths, dpi=72, squeeze=False)
-    images = [[clean(radar_image), generated] for _, radar_image, generated in results]
-    plots.draw_image_grid(axes[:, :2], images, ("real radar", "generated"), labels, half=50.0, vmax=(70, 255))
-    for row, (points, _, _), pose in zip(axes, results, poses, strict=True):
-        placed = transform_points(pose, points)
-        away = map_tree.query(placed)[0]
-        plots.show_points(row[2], crop(map_points, pose, 80.0), colour=COLOURS["map"], size=0.3)
-        plots.show_points(row[2], placed[away < 1.0], colour=COLOURS["fake"], size=2.5)
-        plots.show_points(row[2], placed[away >= 1.0], colour=COLOURS["estimate"], size=2.5)
-        plots.zoom(row[2], pose[:2], 50.0)
-        row[2].set(xticks=[], yticks=[], xlabel="", ylabel="")
-        text = "\n".join(f"{100 * np.mean(away < r):.0f} % below {r} m" for r in (1, 2))
-        plots.draw_distances(
-            row[3], distance_histogram(away, edges), edges, text=f"{text}\n{len(points)} points"
-        )
-        row[3].set(xlabel="")
-    axes[0, 2].set_title("on the map")
-    axes[0, 3].set_title("nearest map point")
-    axes[-1, 3].set_xlabel("distance [m]")
     return figure
 
 
@@ -210,7 +173,7 @@ def draw_points_on_scans(
     -------
     figure : Figure
     """
-    figure, axes = plt.subplots(1, len(images), figsize=(9.6, 0.4 + 9.6 / len(images)), dpi=75)
+    figure, axes = plots.subplots(1, len(images), height=0.6 + plots.WIDTH / len(images))
     names = {"real": "lidar", "fake": "generated"}
     for ax, image, layer, title in zip(axes, images, layers, titles, strict=True):
         plots.show_image(ax, clean(image), vmax=vmax)
@@ -219,7 +182,7 @@ def draw_points_on_scans(
         plots.zoom(ax, (0.0, 0.0), half).set(title=title)
     for ax in axes[1:]:
         ax.set_ylabel("")
-    axes[0].legend(loc="upper left", markerscale=3, frameon=True, fontsize=8.5)
+    axes[0].legend(loc="upper left", markerscale=3, frameon=True)
     return figure
 
 
@@ -237,7 +200,7 @@ def draw_adaptation(curves: Mapping[str, Any], raw: tuple[float, float]) -> Figu
     -------
     figure : Figure
     """
-    figure, ax = plt.subplots(figsize=(6.4, 3.6))
+    figure, ax = plots.subplots(height=3.6)
     for (label, curve), colour in zip(curves.items(), ("fake", "estimate"), strict=True):
         ax.plot(curve.n, 100 * curve.share_1m, "o-", color=COLOURS[colour], markersize=3.5, label=label)
     ax.plot(raw[0], 100 * raw[1], "s", color=COLOURS["radar"], label="raw peaks")
@@ -279,7 +242,7 @@ def draw_localization(
     """
     middle = truth[:, :2].mean(axis=0)
     half = max(20.0, 0.6 * np.ptp(truth[:, :2], axis=0).max() + 8.0)
-    figure = plt.figure(figsize=(9.6, 4.2), dpi=90)
+    figure = plt.figure(figsize=(plots.WIDTH, 4.2))
     left, right = figure.subfigures(1, 2, width_ratios=(1, 1.15))
     ax = left.subplots()
     plots.show_points(ax, crop(map_points, middle, half + 2.0), colour=COLOURS["map"], size=1.5)
@@ -290,7 +253,7 @@ def draw_localization(
     plots.show_poses(ax, start[None], colour=COLOURS["real"], length=4.0)
     ax.plot([], [], color=COLOURS["real"], label="start")
     plots.zoom(ax, middle, half)
-    ax.legend(loc="upper left", fontsize=8.5, frameon=True)
+    ax.legend(loc="upper left", frameon=True)
     axes = right.subplots(2, 1, sharex=True)
     for label, (every, colour) in errors.items():
         for k, ax in enumerate(axes):
@@ -330,7 +293,7 @@ def draw_submap(
     -------
     figure : Figure
     """
-    figure, (ax, other, last) = plt.subplots(1, 3, figsize=(9.6, 3.9), dpi=85, width_ratios=(1, 1, 0.8))
+    figure, (ax, other, last) = plots.subplots(1, 3, height=3.6)
     middle = path[:, :2].mean(axis=0)
     size = np.ptp(path[:, :2], axis=0).max() / 2.0 + 30.0
     plots.show_points(ax, crop(map_points, middle, size), colour=COLOURS["map"], size=1.5, label="map")
@@ -346,10 +309,11 @@ def draw_submap(
     other.set(title="changes", ylabel="")
     for axes in (ax, other):
         plots.zoom(axes, middle, size)
-        axes.legend(loc="upper left", markerscale=4, frameon=True, fontsize=8.5)
+        axes.legend(loc="upper left", markerscale=4, frameon=True)
     last.plot(sharpness[0], sharpness[1] / 1000.0, "o-", color=COLOURS["real"])
     last.axvline(0.0, color="#444444", linewidth=0.9, linestyle="--")
-    last.set(title="sharpness", xlabel="rotation of the sweeps [deg]", ylabel="occupied cells [thousands]")
+    last.set_box_aspect(1.0)
+    last.set(title="sharpness", xlabel="rotation of sweeps [deg]", ylabel="occupied cells [1000]")
     return figure
 
 
@@ -371,8 +335,7 @@ def draw_lidar_and_map(
     -------
     figure : Figure
     """
-    width = 9.6 / len(clouds)
-    figure, axes = plt.subplots(1, len(clouds), figsize=(9.6, width + 0.4), dpi=75)
+    figure, axes = plots.subplots(1, len(clouds), height=0.6 + plots.WIDTH / len(clouds))
     for ax, (reference, points, colour), title in zip(axes, clouds, titles, strict=True):
         plots.show_points(ax, crop(reference, np.zeros(2), 1.2 * half), colour=COLOURS["map"], size=0.6)
         plots.show_points(ax, points, colour=COLOURS[colour], size=3.0, title=title)

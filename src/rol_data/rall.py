@@ -9,7 +9,7 @@ is called `real_root`, in the layout of the public repositories, see `data/READM
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -348,19 +348,11 @@ def load_scans(real_root: Path | str) -> list[RealScan]:
         If a scan or the odometry is at fault.
     """
     folder, poses = Path(real_root) / SCANS_PATH / "radar", load_scan_poses(find_scan_poses(real_root))
-    stamps = sorted(stamp for stamp in poses if (folder / f"{stamp}.png").is_file())
-    if not stamps:
+    paths = [path for stamp in sorted(poses) if (path := folder / f"{stamp}.png").is_file()]
+    if not paths:
         raise RallError(f"{folder}: holds none of the {len(poses)} scans of {SCAN_POSES_PATH}")
-    twists = {
-        **_twists_between(poses),
-        **_official_twists(folder.parent / "gt" / "radar_odometry.csv", stamps),
-    }
-    scans = []
-    for stamp in stamps:
-        path = folder / f"{stamp}.png"
-        scan = load_radar(path)
-        scans.append(RealScan(path, stamp, scan.power, scan.azimuths, poses[stamp], twists.get(stamp)))
-    return scans
+    official = _official_twists(folder.parent / "gt" / "radar_odometry.csv")
+    return _load_with_poses(paths, poses, {**_twists_between(poses), **official}, SCAN_POSES_PATH)
 
 
 def load_posed_scans(real_root: Path | str) -> list[RealScan]:
@@ -381,28 +373,37 @@ def load_posed_scans(real_root: Path | str) -> list[RealScan]:
     Raises
     ------
     RallError
-        If a scan is not in the odometry, or has no row in the ground truth.
+        If a scan is not in the odometry or has no row in the ground truth; the message names both files and
+        their lengths.
     rol.oxford.OxfordError
         If a scan or the odometry is at fault.
     """
     paths = sorted((Path(real_root) / POSED_SCANS_PATH).glob("[!.]*.png"))
     if not paths:
         return []
-    odometry = load_radar_odometry(Path(real_root) / SESSION_01_PATH / "gt" / "radar_odometry.csv")
-    stamps, twists = compose_odometry(odometry)[0], estimate_twists(odometry)
+    odometry = Path(real_root) / SESSION_01_PATH / "gt" / "radar_odometry.csv"
     poses_path = Path(real_root) / POSES_PATH / "pose_xy_01.txt"
-    poses, found = load_poses(poses_path), []
+    stamps, truth = compose_odometry(load_radar_odometry(odometry))[0].tolist(), load_poses(poses_path)
+    poses = dict(zip(stamps, truth, strict=False))
+    known = f"the {len(stamps)} scans of {odometry} with the {len(truth)} poses of {poses_path}"
+    return _load_with_poses(paths, poses, _official_twists(odometry), known)
+
+
+def _load_with_poses(
+    paths: Sequence[Path],
+    poses: Mapping[int, np.ndarray],
+    twists: Mapping[int, tuple[float, float, float]],
+    known: Path | str,
+) -> list[RealScan]:
+    """Read scans and look up pose and velocity by their stamps; `known` names the list of the poses."""
+    scans = []
     for path in paths:
         scan = load_radar(path)
-        (rows,) = np.nonzero(stamps == scan.stamp_us)
-        if len(rows) == 0:
-            raise RallError(f"{path}: the scan is not in {odometry.path}")
-        if rows[0] >= len(poses):
-            raise RallError(f"{poses_path}: has {len(poses)} rows, none for scan {rows[0]} ({path.name})")
-        twist = tuple(float(value) for value in twists[rows[0]])
-        pose = poses[rows[0]]
-        found.append(RealScan(path, scan.stamp_us, scan.power, scan.azimuths, pose, twist))
-    return found
+        stamp = scan.stamp_us
+        if stamp not in poses:
+            raise RallError(f"{path}: the scan is not among {known}")
+        scans.append(RealScan(path, stamp, scan.power, scan.azimuths, poses[stamp], twists.get(stamp)))
+    return scans
 
 
 @dataclass(frozen=True)
@@ -552,16 +553,16 @@ def group_scans(stamps_us: Sequence[int], max_gap_s: float = 1.0) -> list[list[i
     return groups
 
 
-def _official_twists(path: Path, stamps: list[int]) -> dict[int, tuple[float, float, float]]:
-    """Estimate the velocity of the scans that the official odometry covers; none if it has gaps."""
+def _official_twists(path: Path) -> dict[int, tuple[float, float, float]]:
+    """Estimate the velocities of the official odometry by stamp; none if it is missing or has gaps."""
     if not path.is_file():
         return {}
     odometry = load_radar_odometry(path)
     try:
-        known = dict(zip(compose_odometry(odometry)[0].tolist(), estimate_twists(odometry), strict=True))
+        stamps, twists = compose_odometry(odometry)[0].tolist(), estimate_twists(odometry)
     except ValueError:
         return {}
-    return {stamp: tuple(float(v) for v in known[stamp]) for stamp in stamps if stamp in known}
+    return {stamp: tuple(map(float, twist)) for stamp, twist in zip(stamps, twists, strict=True)}
 
 
 def _twists_between(poses: dict[int, np.ndarray]) -> dict[int, tuple[float, float, float]]:

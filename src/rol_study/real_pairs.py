@@ -1,4 +1,4 @@
-"""Compare real radar scans with the lidar sweeps of the same moment: alignment, calibration, similarity.
+"""Compare real radar scans with the lidar sweeps of the same moment: alignment, ground, similarity.
 
 Everything is in the radar frame, x forward, y left [m], and refers to a scan and its sweeps as
 `rol_data.oxford_pairs.find_pairs` finds them. "Compensated" means that radar and lidar are brought to
@@ -8,17 +8,15 @@ both as recorded.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from functools import cached_property
-from pathlib import Path
+from itertools import product
 from typing import TYPE_CHECKING
 
-import cv2
 import numpy as np
 import pandas as pd
-from scipy.ndimage import gaussian_filter, gaussian_filter1d, minimum_filter1d, uniform_filter1d
-from scipy.optimize import minimize
+from scipy.ndimage import minimum_filter1d
 from scipy.spatial import cKDTree
 
 from rol.bev import image_to_points, points_to_image
@@ -29,13 +27,12 @@ from rol.oxford import (
     compose_odometry,
     load_radar,
     load_radar_odometry,
-    load_velodyne_binary,
 )
 from rol.pairs import PairSettings, radar_to_image
-from rol.radar import DOPPLER_SECONDS, MEASURED, SCAN_SECONDS, RangeCalibration, deskew_points
+from rol.radar import MEASURED, SCAN_SECONDS, RangeCalibration, deskew_points
 from rol.similarity import fraction_within, nn_distances
 from rol_beyond.front_ends import DETECTORS, detect_points, evaluate_on_map, generate_points
-from rol_data.oxford_pairs import PairedScan, RealPairs, Sweep, load_sweep_points, sweep_start
+from rol_data.oxford_pairs import PairedScan, RealPairs, Sweep, load_sweep_points
 from rol_study.misalignment import measure_misalignment
 
 if TYPE_CHECKING:
@@ -43,6 +40,8 @@ if TYPE_CHECKING:
 
 MOTIONS = ("none", "compensated")
 REFERENCES = ("nearest", "turn")  # sweeps that the lidar points come from
+AS_IN_PAPER, BEST = ("none", "nearest"), ("compensated", "turn")  # motion and reference of the main results
+Pairs = Mapping[tuple[str, str], "Pair"]  # of one scan: (motion, sweeps) -> pair
 COLUMNS = ["timestamp_us", "front_end", "motion", "sweeps", "n_points", "n_lidar_points", "precision_1m"]
 COLUMNS += ["precision_2m", "recall_1m", "recall_2m", "misalignment_forward_m", "misalignment_left_m"]
 PIXEL_M = 0.25
@@ -197,6 +196,65 @@ def load_path(scan: PairedScan) -> np.ndarray | None:
     return compose_odometry(load_radar_odometry(scan.odometry_path))[2]
 
 
+def describe_scans(found: RealPairs) -> dict[str, float]:
+    """Count what was found: ``n_scans``, ``n_sweeps``, ``seconds``, ``distance`` [m], ``speed_min``,
+    ``speed_max`` [m/s]; NaN where there is no scan or no velocity."""
+    stamps = pd.Series([scan.stamp_us for scan in found.scans], dtype=float) / 1e6
+    speeds = pd.Series([scan.twist[0] if scan.twist else np.nan for scan in found.scans], dtype=float)
+    return {
+        "n_scans": len(found.scans),
+        "n_sweeps": len(found.sweeps),
+        "seconds": stamps.max() - stamps.min() + SCAN_SECONDS,
+        "distance": (speeds * -stamps.diff(-1)).sum(),
+        "speed_min": speeds.min(),
+        "speed_max": speeds.max(),
+    }
+
+
+def tabulate_misalignment(scans: Iterable[Pairs]) -> pd.DataFrame:
+    """Measure the shift of radar images against lidar images.
+
+    Parameters
+    ----------
+    scans : iterable of mapping
+        Of each scan: what `load_scan_pairs` returns.
+
+    Returns
+    -------
+    table : pandas.DataFrame
+        One row per pair: ``motion``, ``sweeps``, ``speed_mps`` (NaN if unknown), ``forward_m``, ``left_m``.
+    """
+    rows = []
+    for pairs in scans:
+        for (motion, sweeps), pair in pairs.items():
+            speed = np.nan if pair.scan.twist is None else pair.scan.twist[0]
+            rows.append((motion, sweeps, speed, *pair.misalignment))
+    return pd.DataFrame(rows, columns=["motion", "sweeps", "speed_mps", "forward_m", "left_m"])
+
+
+def describe_misalignment(table: pd.DataFrame) -> dict[str, float]:
+    """Summarize `tabulate_misalignment` for the nearest sweeps.
+
+    Parameters
+    ----------
+    table : pandas.DataFrame
+        The table; it may be empty.
+
+    Returns
+    -------
+    numbers : dict
+        ``lag_none`` (mean distance of the radar behind the lidar as recorded) [m], ``lag_per_speed`` [s],
+        ``lag_compensated`` (ahead of it when compensated) [m]; NaN without pairs.
+    """
+    nearest = table[table.sweeps == "nearest"].astype({"speed_mps": float, "forward_m": float})
+    recorded, compensated = (nearest[nearest.motion == motion] for motion in MOTIONS)
+    return {
+        "lag_none": -recorded.forward_m.mean(),
+        "lag_per_speed": -(recorded.forward_m / recorded.speed_mps).mean(),
+        "lag_compensated": compensated.forward_m.mean(),
+    }
+
+
 def compare_points(points: np.ndarray, lidar: np.ndarray) -> dict[str, float | int]:
     """Compute precision and recall of points against lidar points.
 
@@ -239,463 +297,6 @@ def chance_level(points: np.ndarray, lidar: np.ndarray, n_turns: int = 8) -> dic
     return dict(zip(("precision_1m", "precision_2m"), np.mean(found, axis=0).tolist(), strict=True))
 
 
-# ---- time of a sweep ----
-
-
-def measure_stamps(sweeps: Sequence[Sweep]) -> tuple[np.ndarray, np.ndarray]:
-    """Compare the time between sweeps with the angle by which the lidar turned meanwhile.
-
-    Parameters
-    ----------
-    sweeps : sequence of Sweep
-        Consecutive sweeps of one lidar, .bin files.
-
-    Returns
-    -------
-    intervals_ms : array, shape (n - 1,)
-        Stamp of the next sweep minus that of a sweep [ms].
-    turned_deg : array, shape (n - 1,)
-        Angle between the first firing of a sweep and that of the next [deg]: 360 and a few.
-    """
-    starts = np.array([sweep_start(load_velodyne_binary(sweep.path)) for sweep in sweeps])
-    turned = 360.0 + np.rad2deg(np.angle(np.exp(1j * np.diff(starts))))
-    return np.diff([sweep.stamp_us for sweep in sweeps]) / 1e3, turned
-
-
-def locate_stamp(
-    intervals_ms: np.ndarray, turned_deg: np.ndarray, max_jitter_ms: float = 2.0
-) -> tuple[float, float, int]:
-    """Estimate where within a sweep its stamp lies, from the lengths of sweeps that differ.
-
-    The time between two stamps is ``(1 - place) * own + place * next``, with the durations of the sweep and
-    of the next one: the first alone if a stamp is the beginning of its sweep, the second alone if it is the
-    end.
-
-    Parameters
-    ----------
-    intervals_ms, turned_deg : array, shape (n,)
-        As of `measure_stamps`.
-    max_jitter_ms : float
-        Intervals farther from their median than this are left out (sweeps lost or late) [ms].
-
-    Returns
-    -------
-    place : float
-        0 for the beginning, 1 for the end; nan if the sweeps are all of one length.
-    error : float
-        Its standard error.
-    n : int
-        Intervals used.
-    """
-    is_good = np.abs(intervals_ms - np.median(intervals_ms)) < max_jitter_ms
-    used = is_good[:-1] & is_good[1:]
-    columns = np.column_stack([turned_deg[:-1], turned_deg[1:], np.ones(len(turned_deg) - 1)])[used]
-    values = intervals_ms[:-1][used]
-    if np.linalg.matrix_rank(columns) < 3:
-        return float("nan"), float("nan"), len(values)
-    weights, *_ = np.linalg.lstsq(columns, values, rcond=None)
-    residual = values - columns @ weights
-    covariance = np.linalg.inv(columns.T @ columns) * (residual @ residual) / max(len(values) - 3, 1)
-    own, following = weights[:2]
-    slope = np.array([-following, own]) / (own + following) ** 2
-    return (
-        float(following / (own + following)),
-        float(np.sqrt(slope @ covariance[:2, :2] @ slope)),
-        len(values),
-    )
-
-
-def sweep_consistency(
-    sweeps: Sequence[Sweep],
-    odometry_path: Path | str,
-    spans_s: Sequence[float],
-    lag: int = 12,
-    n_pairs: int = 16,
-) -> np.ndarray:
-    """Measure how well sweeps agree with later ones for several durations of a sweep.
-
-    Both sweeps are brought into one frame by the odometry, each point at the time that the duration gives it.
-
-    Parameters
-    ----------
-    sweeps : sequence of Sweep
-        Consecutive sweeps of one lidar, .bin files.
-    odometry_path : path
-        Odometry of the radar; sweeps outside its span are left out.
-    spans_s : sequence of float
-        Durations to try: 0.05 for a turn with the stamp at its beginning, 0 for all points at once, -0.05 for
-        points fired the other way round [s].
-    lag : int
-        Sweeps between the two that are compared.
-    n_pairs : int
-        Pairs of sweeps, spread over the odometry's span.
-
-    Returns
-    -------
-    distances : array, shape (n_pairs, s)
-        Mean distance of the later sweep's points to the earlier one's, each limited to 0.5 m [m]; no row with
-        too few sweeps.
-    """
-    _, mids, poses = compose_odometry(load_radar_odometry(odometry_path))
-    kept = [s for s in sweeps if mids[0] < s.stamp_us < mids[-1] - 100_000]
-    starts = np.linspace(0, max(len(kept) - lag - 1, 0), n_pairs).astype(int)
-    table = []
-    for start in np.unique(starts) if len(kept) > lag else ():
-        two = [kept[start], kept[start + lag]]
-        loaded = [_upright(*load_sweep_points(sweep, span_s=1.0)) for sweep in two]
-        row = []
-        for span in spans_s:
-            clouds = [
-                _to_map(points, s.stamp_us + 1e6 * span * part, mids, poses)
-                for s, (points, part) in zip(two, loaded, strict=True)
-            ]
-            distances = cKDTree(clouds[0]).query(clouds[1][::3], distance_upper_bound=0.5)[0]
-            row.append(float(np.minimum(distances, 0.5).mean()))
-        table.append(row)
-    return np.array(table).reshape(-1, len(spans_s))
-
-
-def fit_span(
-    spans_s: Sequence[float], distances: np.ndarray, rng: np.random.Generator, n_resamples: int = 200
-) -> tuple[float, float]:
-    """Fit the duration of a sweep at which sweeps agree best.
-
-    Parameters
-    ----------
-    spans_s, distances : array, shape (s,) and (n, s)
-        As of `sweep_consistency`.
-    rng : numpy.random.Generator
-        Source of randomness of the bootstrap over pairs of sweeps.
-    n_resamples : int
-        Resamples of the bootstrap.
-
-    Returns
-    -------
-    span, error : float
-        Vertex of the parabola through the mean distances and its standard error [s]; nan without a minimum.
-    """
-    if len(distances) < 2:
-        return float("nan"), float("nan")
-
-    def vertex(rows: np.ndarray) -> float:
-        bend, slope, _ = np.polyfit(spans_s, rows.mean(axis=0), 2)
-        return -slope / (2.0 * bend) if bend > 0.0 else np.nan
-
-    n = len(distances)
-    again = [vertex(distances[rng.integers(0, n, n)]) for _ in range(n_resamples)]
-    return float(vertex(distances)), float(np.nanstd(again))
-
-
-def _upright(points: np.ndarray, seconds: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Keep points of upright things, where height does not matter, as 2D points with their times."""
-    kept = (points[:, 2] > -0.5) & (points[:, 2] < 4.0) & (np.hypot(points[:, 0], points[:, 1]) < 30.0)
-    return points[kept, :2], seconds[kept]
-
-
-def _to_map(points: np.ndarray, stamps_us: np.ndarray, mids_us: np.ndarray, poses: np.ndarray) -> np.ndarray:
-    """Move points to the odometry's frame with the pose interpolated at each point's time."""
-    x, y, yaw = (np.interp(stamps_us, mids_us, values) for values in (*poses.T[:2], np.unwrap(poses[:, 2])))
-    c, s = np.cos(yaw), np.sin(yaw)
-    return np.column_stack([c * points[:, 0] - s * points[:, 1] + x, s * points[:, 0] + c * points[:, 1] + y])
-
-
-# ---- calibration of the radar against the lidar ----
-
-
-@dataclass(frozen=True)
-class Calibration:
-    """What the radar's geometry depends on.
-
-    Attributes
-    ----------
-    rotation_deg : float
-        Rotation of the radar image against the lidar points, counter-clockwise [deg].
-    forward_m, left_m : float
-        Shift of the radar image against the lidar points [m].
-    delay_s : float
-        Time by which the sweeps were measured later than their stamps say [s].
-    doppler_s : float
-        Ranges read nearer by this time multiplied by the closing speed [s].
-    resolution_m, offset_m : float
-        Length of a bin and offset of all ranges [m].
-    """
-
-    rotation_deg: float = 0.0
-    forward_m: float = 0.0
-    left_m: float = 0.0
-    delay_s: float = 0.0
-    doppler_s: float = DOPPLER_SECONDS
-    resolution_m: float = MEASURED.resolution_m
-    offset_m: float = MEASURED.offset_m
-
-
-STEPS = {  # of numerical derivatives and of the search
-    "rotation_deg": 0.3,
-    "forward_m": 0.15,
-    "left_m": 0.15,
-    "delay_s": 0.02,
-    "doppler_s": 0.02,
-    "resolution_m": 0.0003,
-    "offset_m": 0.15,
-}
-
-
-class RadarAgreement:
-    """Agreement of scans with the lidar points of their turns, as a function of the calibration.
-
-    Parameters
-    ----------
-    pairs : sequence of Pair
-        Motion-compensated pairs; those without lidar points in the range are left out.
-    min_range, max_range : float
-        Range of the lidar points used [m].
-    max_points : int
-        Most points of a scan, taken at a regular interval.
-    """
-
-    def __init__(
-        self, pairs: Sequence[Pair], min_range: float = 5.0, max_range: float = 50.0, max_points: int = 1500
-    ) -> None:
-        clouds = [crop_range(pair.lidar_points, max_range, min_range) for pair in pairs]
-        self.points = [cloud[:: len(cloud) // max_points + 1] for cloud in clouds if len(cloud)]
-        pairs = [pair for pair, cloud in zip(pairs, clouds, strict=True) if len(cloud)]
-        self.images = [_sharpen_polar(pair.radar.power) for pair in pairs]
-        self.azimuths = [pair.radar.azimuths for pair in pairs]
-        self.twists = [pair.scan.twist for pair in pairs]
-
-    def scores(self, calibration: Calibration) -> np.ndarray:
-        """Compute the mean sharpened power at the lidar points of every scan, shape (n,).
-
-        Parameters
-        ----------
-        calibration : Calibration
-            The radar's geometry.
-        """
-        found = []
-        for image, azimuths, twist, points in zip(
-            self.images, self.azimuths, self.twists, self.points, strict=True
-        ):
-            rows, bins = _beam_at(points, calibration, azimuths, twist)
-            values = cv2.remap(image, bins[:, None], rows[:, None], cv2.INTER_LINEAR)
-            found.append(float(values.mean()))
-        return np.array(found)
-
-    def fit(
-        self, names: Sequence[str], start: Calibration | None = None
-    ) -> tuple[Calibration, dict[str, float]]:
-        """Find the calibration of the best agreement.
-
-        Parameters
-        ----------
-        names : sequence of str
-            Fields of `Calibration` to estimate; the others stay as in `start`.
-        start : Calibration, optional
-            Where to begin.
-
-        Returns
-        -------
-        calibration : Calibration
-            The best one; nan without any lidar point in range.
-        errors : dict
-            Standard error of each field estimated, from the spread of the scans' gradients (scans taken as
-            independent, which neighbours in one street are not).
-        """
-        if not self.points:
-            return Calibration(*[np.nan] * 7), dict.fromkeys(names, np.nan)
-        start, steps = start or Calibration(), np.array([STEPS[name] for name in names])
-        origin = np.array([getattr(start, name) for name in names])
-
-        def per_scan(x: np.ndarray) -> np.ndarray:
-            values = dict(zip(names, (origin + steps * x).tolist(), strict=True))
-            return self.scores(replace(start, **values))
-
-        n = len(names)
-        simplex = np.vstack([np.zeros(n), np.eye(n)])
-        options = {"initial_simplex": simplex, "xatol": 0.01, "fatol": 1e-4, "maxfev": 150 * n}
-        best = minimize(
-            lambda x: -float(per_scan(x).mean()), np.zeros(n), method="Nelder-Mead", options=options
-        ).x
-        values = dict(zip(names, (origin + steps * best).tolist(), strict=True))
-        errors = steps * _sandwich_errors(per_scan, best)
-        return replace(start, **values), dict(zip(names, errors.tolist(), strict=True))
-
-
-def _sandwich_errors(per_scan, best: np.ndarray, h: float = 0.5) -> np.ndarray:
-    """Compute standard errors of an extremum from gradients per scan and the common curvature."""
-    n, unit = len(best), h * np.eye(len(best))
-    gradients = np.array([(per_scan(best + e) - per_scan(best - e)) / (2.0 * h) for e in unit]).T
-    curvature = np.empty((n, n))
-    for i in range(n):
-        for j in range(n):
-            signs = ((1, 1), (1, -1), (-1, 1), (-1, -1))
-            values = [a * b * per_scan(best + a * unit[i] + b * unit[j]).mean() for a, b in signs]
-            curvature[i, j] = sum(values) / (4.0 * h * h)
-    inverse = np.linalg.pinv(curvature) / len(gradients)
-    gradients = gradients - gradients.mean(axis=0)
-    return np.sqrt(np.diag(inverse @ (gradients.T @ gradients) @ inverse))
-
-
-def _sharpen_polar(power: np.ndarray) -> np.ndarray:
-    """Subtract the mean of 8 m along range and smooth by about the radar's own point spread."""
-    values = power.astype(np.float32)
-    values = gaussian_filter(
-        values - uniform_filter1d(values, 183, axis=1), (0.7, 3.0), mode=("wrap", "nearest")
-    )
-    return np.concatenate([values[-1:], values, values[:1]])
-
-
-def _beam_at(
-    points: np.ndarray, c: Calibration, azimuths: np.ndarray, twist: Sequence[float]
-) -> tuple[np.ndarray, np.ndarray]:
-    """Compute row (plus one) and bin at which the moving radar saw places given at mid-scan."""
-    turn = np.deg2rad(c.rotation_deg)
-    moved = transform_points((c.forward_m, c.left_m, turn), points) + c.delay_s * np.asarray(twist[:2])
-    n, step = len(azimuths), (azimuths[0] - azimuths[-1]) / (len(azimuths) - 1)
-    seen = moved
-    for _ in range(2):
-        rows = (
-            np.mod(-np.arctan2(seen[:, 1], seen[:, 0]) + azimuths[0] + 0.5 * step, 2.0 * np.pi) / step - 0.5
-        )
-        seconds = (rows / n - 0.5) * SCAN_SECONDS
-        yaw = twist[2] * seconds
-        d = moved - seconds[:, None] * np.asarray(twist[:2])
-        cos, sin = np.cos(yaw), np.sin(yaw)
-        seen = np.column_stack([cos * d[:, 0] + sin * d[:, 1], cos * d[:, 1] - sin * d[:, 0]])
-    ranges = np.hypot(seen[:, 0], seen[:, 1])
-    ranges = ranges - c.doppler_s * (seen @ np.asarray(twist[:2])) / np.maximum(ranges, 1e-6)
-    bins = (ranges - c.offset_m) / c.resolution_m - 0.5
-    return (rows + 1.0).astype(np.float32), bins.astype(np.float32)
-
-
-def measure_walls(pairs: Sequence[Pair], calibration: Calibration) -> pd.DataFrame:
-    """Find walls that lidar and radar see in the same direction.
-
-    A wall is the first surface in the direction of a radar row, if its lidar points within 0.35 m of range
-    span 1.5 m of height or more. Its radar echo is the strongest one within 1.2 m.
-
-    Parameters
-    ----------
-    pairs : sequence of Pair
-        Motion-compensated pairs.
-    calibration : Calibration
-        The radar's geometry; its ranges serve to look for echoes only.
-
-    Returns
-    -------
-    walls : pandas.DataFrame
-        One row per wall and radar row: ``scan`` (number of the pair), ``range_m`` by the lidar, as the moving
-        radar would measure it with the Doppler shift, ``bin`` of the echo, ``aside`` (absolute sine of the
-        bearing).
-    """
-    found = []
-    for number, pair in enumerate(pairs):
-        points = crop_range(pair.cloud, 50.0, 4.0)
-        points = points[(points[:, 2] > -1.0) & (points[:, 2] < 4.0)]
-        one_metre = replace(calibration, resolution_m=1.0, offset_m=-0.5)  # the bin is the range in metres
-        azimuths = pair.radar.azimuths
-        rows, ranges = _beam_at(points[:, :2], one_metre, azimuths, pair.scan.twist)
-        nearest = np.rint(rows - 1.0).astype(int) % len(azimuths)
-        smooth = gaussian_filter1d(pair.radar.power.astype(np.float32), 2.0, axis=1)
-        order = np.lexsort((ranges, nearest))
-        for part in np.split(order, np.flatnonzero(np.diff(nearest[order])) + 1):
-            row = nearest[part[0]]
-            first = part[ranges[part] < ranges[part[0]] + 0.35]
-            if len(first) < 5 or np.ptp(points[first, 2]) < 1.5:
-                continue
-            wall = float(np.median(ranges[first]))
-            echo = _find_echo(smooth[row], (wall - calibration.offset_m) / calibration.resolution_m - 0.5)
-            found.append((number, wall, echo, abs(np.sin(azimuths[row]))))
-    table = pd.DataFrame(found, columns=["scan", "range_m", "bin", "aside"], dtype=float)
-    return table[np.isfinite(table.bin)].reset_index(drop=True)
-
-
-def _find_echo(power: np.ndarray, middle: float, reach: int = 28, min_power: float = 70.0) -> float:
-    """Find the strongest echo near a bin, to a fraction of a bin; nan if it is weak or lies at the border."""
-    first = max(round(middle) - reach, 0)
-    part = power[first : first + 2 * reach + 1]
-    best = int(np.argmax(part))
-    if not 0 < best < len(part) - 1 or part[best] < min_power:
-        return np.nan
-    left, top, right = part[best - 1 : best + 2]
-    bend = left - 2.0 * top + right
-    return first + best + (0.5 * (left - right) / bend if bend < 0.0 else 0.0)
-
-
-def fit_ranges(walls: pd.DataFrame) -> tuple[np.ndarray, np.ndarray]:
-    """Fit length of a bin and offset of the radar's ranges to walls.
-
-    Parameters
-    ----------
-    walls : pandas.DataFrame
-        As of `measure_walls`.
-
-    Returns
-    -------
-    values, errors : array, shape (2,)
-        Resolution and offset [m], and their standard errors by leaving out one scan at a time; nan with fewer
-        than 20 walls.
-    """
-
-    def fit(table: pd.DataFrame) -> np.ndarray:
-        weights = np.ones(len(table))
-        for _ in range(20):  # iteratively reweighted: distances beyond 0.1 m count linearly
-            line = np.polyfit(table.bin + 0.5, table.range_m, 1, w=np.sqrt(weights))
-            weights = 1.0 / np.hypot(1.0, (np.polyval(line, table.bin + 0.5) - table.range_m) / 0.1)
-        return line
-
-    if len(walls) < 20:
-        return np.full(2, np.nan), np.full(2, np.nan)
-    scans = walls.scan.unique()
-    others = (
-        np.array([fit(walls[walls.scan != scan]) for scan in scans])
-        if len(scans) > 1
-        else np.full((1, 2), np.nan)
-    )
-    errors = np.sqrt((len(scans) - 1) * ((others - others.mean(axis=0)) ** 2).mean(axis=0))
-    return fit(walls), errors
-
-
-def calibrate(pairs: Sequence[Pair]) -> tuple[pd.DataFrame, pd.DataFrame]:
-    """Calibrate the radar against the lidar: rotation and shift, delay and Doppler constant, ranges.
-
-    Parameters
-    ----------
-    pairs : sequence of Pair
-        Motion-compensated pairs.
-
-    Returns
-    -------
-    table : pandas.DataFrame
-        Columns ``value`` and ``error`` (standard error) of ``rotation_deg``, ``forward_m``, ``left_m``
-        (fitted together), the rotation by points near and far from the radar alone, ``delay_ms``,
-        ``doppler_s`` (fitted together with a rotation and a shift to the left), ``resolution_m`` and
-        ``offset_m`` (fitted to the walls), and the offset with that resolution by walls beside, and ahead or
-        behind, alone; ``beyond_m``, the median distance by which the ranges used in this project show walls
-        too far away.
-    walls : pandas.DataFrame
-        As of `measure_walls`.
-    """
-    agreement = RadarAgreement(pairs)
-    placed, errors = agreement.fit(["rotation_deg", "forward_m", "left_m"])
-    rows = {name: (getattr(placed, name), error) for name, error in errors.items()}
-    for limits in ((5.0, 20.0), (20.0, 50.0)):
-        ring, errors = RadarAgreement(pairs, *limits).fit(["rotation_deg"], placed)
-        rows["rotation_deg, {:.0f} to {:.0f} m".format(*limits)] = ring.rotation_deg, errors["rotation_deg"]
-    timed, errors = agreement.fit(["rotation_deg", "left_m", "delay_s", "doppler_s"])
-    rows["delay_ms"] = 1e3 * timed.delay_s, 1e3 * errors["delay_s"]
-    rows["doppler_s"] = timed.doppler_s, errors["doppler_s"]
-    walls = measure_walls(pairs, placed)
-    ranges, range_errors = fit_ranges(walls)
-    rows |= dict(zip(("resolution_m", "offset_m"), zip(ranges, range_errors, strict=True), strict=True))
-    offsets = walls.range_m - (walls.bin + 0.5) * ranges[0]
-    for name, is_there in {"beside": walls.aside > 0.8, "ahead or behind": walls.aside < 0.6}.items():
-        by_scan = offsets[is_there].groupby(walls.scan[is_there]).median()
-        rows[f"offset_m, walls {name}"] = offsets[is_there].median(), by_scan.sem()
-    beyond = (walls.bin + 0.5) * MEASURED.resolution_m + MEASURED.offset_m - walls.range_m
-    rows["beyond_m"] = beyond.median(), beyond.groupby(walls.scan).median().sem()
-    return pd.DataFrame(rows, index=["value", "error"]).T, walls
-
-
 # ---- ground ----
 
 
@@ -729,6 +330,67 @@ def fit_ground(cloud: np.ndarray, radius_m: float = 25.0, near: float = 0.5) -> 
         kept = np.abs(points[:, 2] - columns @ plane) < limit
         plane, *_ = np.linalg.lstsq(columns[kept], points[kept, 2], rcond=None)
     return tuple(float(value) for value in plane)
+
+
+@dataclass(frozen=True, eq=False)
+class Ground:
+    """Ground of real sweeps, see `measure_ground`.
+
+    Attributes
+    ----------
+    near_m, far_m : array, shape (n,) and (m,)
+        Heights of the points within 20 m, and of the others [m].
+    levels_m, kept : array, shape (k,)
+        Thresholds [m] and fraction of the points above them, mean over pairs.
+    numbers : dict
+        ``ground`` (height of the radar above the plane) and ``ground_sd`` [m], ``slope`` and ``slope_left``
+        [%], ``margin`` of the threshold above the plane [m], ``max_slope`` that uses it up over 30 m [%], and
+        percentages: ``kept`` of the points, and ``low`` of the occupied pixels without a point 0.3 m above
+        the plane. NaN without pairs.
+    """
+
+    near_m: np.ndarray
+    far_m: np.ndarray
+    levels_m: np.ndarray
+    kept: np.ndarray
+    numbers: dict[str, float]
+
+
+def measure_ground(pairs: Sequence[Pair], min_height: float) -> Ground:
+    """Measure the ground of real sweeps and what a threshold on the height keeps.
+
+    Parameters
+    ----------
+    pairs : sequence of Pair
+        The pairs; their clouds hold the ground.
+    min_height : float
+        Threshold in use [m].
+
+    Returns
+    -------
+    ground : Ground
+    """
+    levels = np.arange(-2.4, 0.05, 0.1)
+    clouds = [crop_range(pair.cloud, pair.max_range) for pair in pairs]
+    columns = ["height", "forward", "left"]
+    planes = pd.DataFrame([fit_ground(cloud) for cloud in clouds], columns=columns, dtype=float)
+    points = np.concatenate([np.zeros((0, 4)), *clouds])
+    is_far = np.hypot(points[:, 0], points[:, 1]) >= 20.0
+    above = pd.DataFrame([[(cloud[:, 2] >= level).mean() for level in levels] for cloud in clouds])
+    lowest = pd.Series([(pair.tops < 0.3).mean() for pair in pairs], dtype=float)
+    height, forward, left = planes.mean()
+    margin = min_height - height
+    numbers = {
+        "ground": -height,
+        "ground_sd": planes.height.std(ddof=0),
+        "slope": 100 * forward,
+        "slope_left": 100 * left,
+        "margin": margin,
+        "max_slope": 100 * margin / 30.0,
+        "kept": 100 * pd.Series(points[:, 2] >= min_height).mean(),
+        "low": 100 * lowest.mean(),
+    }
+    return Ground(points[~is_far, 2], points[is_far, 2], levels, above.mean().to_numpy(), numbers)
 
 
 # ---- kinds of points ----
@@ -829,7 +491,10 @@ def tabulate_kinds(
         One row per front end, percentages over all pairs: of ``points`` by distance from the path; of these
         ``within 1 m`` of a lidar point; of the ``lidar points reached`` within 1 m, by the height of the
         highest in the pixel; and of points ``over 2 m off``, all and those in view, see `describe_points`.
+        Empty without pairs.
     """
+    if not pairs:
+        return pd.DataFrame()
     found, lidar = [], []
     for pair, clouds in zip(pairs, points, strict=True):
         for name, cloud in clouds.items():
@@ -852,9 +517,20 @@ def tabulate_kinds(
         "points": by_zone.size().unstack().div(own.size(), axis=0),
         "within 1 m": by_zone.right.mean().unstack(),
         "lidar points reached": by_height.near.mean().unstack(),
-        "over 2 m off": own[["all", "in_view"]].mean(),
+        "over 2 m off": own[["all", "in_view"]].mean().rename(columns={"in_view": "in view"}),
     }
     return 100.0 * pd.concat(parts, axis=1)
+
+
+def describe_kinds(table: pd.DataFrame, network: str) -> dict[str, float]:
+    """Name percentages of `tabulate_kinds` for a text: ``on_road`` (within 4 m of the path), ``in_view`` and
+    ``hidden`` (more than 2 m off) of a network's points; NaN with an empty table."""
+    if table.empty:
+        return dict.fromkeys(("on_road", "in_view", "hidden"), np.nan)
+    own = table.loc[network]
+    in_view = own["over 2 m off", "in view"]
+    hidden = own["over 2 m off", "all"] - in_view
+    return {"on_road": own["points", "0-4 m"], "in_view": in_view, "hidden": hidden}
 
 
 def tabulate_corrected(
@@ -878,8 +554,10 @@ def tabulate_corrected(
     -------
     table : pandas.DataFrame
         One row per front end; of "as is" and "corrected" the percentages within 0.25, 0.5 and 1 m, means over
-        pairs.
+        pairs. Empty without pairs.
     """
+    if not pairs:
+        return pd.DataFrame()
     rows = []
     for pair, clouds in zip(pairs, points, strict=True):
         for name, cloud in clouds.items():
@@ -892,6 +570,15 @@ def tabulate_corrected(
                 rows.append({"front_end": name, "points": words} | fractions)
     table = pd.DataFrame(rows).groupby(["front_end", "points"], sort=False).mean().unstack()
     return table.swaplevel(axis=1)[["as is", "corrected"]]
+
+
+def describe_corrected(table: pd.DataFrame, network: str) -> dict[str, float]:
+    """Name percentages of `tabulate_corrected` within 0.25 m for a text: ``fine_as_is`` and
+    ``fine_corrected`` of a network; NaN with an empty table."""
+    kinds = {"fine_as_is": "as is", "fine_corrected": "corrected"}
+    return {
+        key: np.nan if table.empty else table.loc[network, (kind, "0.25 m")] for key, kind in kinds.items()
+    }
 
 
 def tabulate_on_map(
@@ -929,6 +616,37 @@ def tabulate_on_map(
                 rows.append({"points": name, **evaluate_on_map(cloud, poses[stamp], map_tree)})
     table = pd.DataFrame(rows, columns=["points", "share_1m", "share_2m", "n"])
     return table.groupby("points", sort=False).mean()
+
+
+def describe_ceiling(table: pd.DataFrame, network: str) -> dict[str, float]:
+    """Summarize the precision on the map beside that near real sweeps.
+
+    Parameters
+    ----------
+    table : pandas.DataFrame
+        Rows as of `tabulate_on_map`: ``share_1m``, ``share_2m``, and ``sweep_1m``, the precision at 1 m near
+        one sweep as recorded (0..1), NaN for the rows of the lidar; it may be empty.
+    network : str
+        Row of the network of the text.
+
+    Returns
+    -------
+    numbers : dict
+        Percentages: ``ceiling_1m`` and ``ceiling_2m`` of the lidar points of the nearest sweep, ``on_map`` of
+        the network; ``gain_min`` and ``gain_max``, by which the fraction near the map exceeds that near one
+        sweep; ``paper_min`` and ``paper_max``, the paper's 40 % with these added. NaN without a row.
+    """
+    table = 100 * table.reindex([*table.index.union(["lidar, nearest", network], sort=False)])
+    gain = table.share_1m - table.sweep_1m
+    return {
+        "ceiling_1m": table.share_1m["lidar, nearest"],
+        "ceiling_2m": table.share_2m["lidar, nearest"],
+        "on_map": table.share_1m[network],
+        "gain_min": gain.min(),
+        "gain_max": gain.max(),
+        "paper_min": 40 + gain.min(),
+        "paper_max": 40 + gain.max(),
+    }
 
 
 # ---- front ends ----
@@ -992,3 +710,129 @@ def tabulate(pair: Pair, points: Mapping[str, np.ndarray]) -> list[dict[str, obj
         row |= compare_points(cloud, pair.lidar_points)
         rows.append(row | {"misalignment_forward_m": forward, "misalignment_left_m": left})
     return rows
+
+
+@dataclass(frozen=True, eq=False)
+class Comparison:
+    """Points of front ends against lidar points, see `compare_front_ends`.
+
+    Attributes
+    ----------
+    rows : pandas.DataFrame
+        One row per scan, motion, reference and front end, with the columns `COLUMNS`.
+    chance : pandas.DataFrame
+        One row per scan, front end, and each of `AS_IN_PAPER` and `BEST`: ``front_end``, ``motion``,
+        ``chance_1m``, as of `chance_level`.
+    points, images : dict
+        (stamp of a scan [us], motion) -> what `front_end_points` returns; of the scans asked for.
+    """
+
+    rows: pd.DataFrame
+    chance: pd.DataFrame
+    points: dict[tuple[int, str], dict[str, np.ndarray]]
+    images: dict[tuple[int, str], dict[str, np.ndarray]]
+
+    def average(self, way: tuple[str, str]) -> pd.DataFrame:
+        """Average the percentages over the scans for a motion and a reference.
+
+        Parameters
+        ----------
+        way : tuple of str
+            `AS_IN_PAPER` or `BEST`; another one has no level by chance.
+
+        Returns
+        -------
+        table : pandas.DataFrame
+            One row per front end: ``precision_1m``, ``precision_2m``, ``recall_1m`` and their standard
+            deviations ``<name>_sd``, and ``chance_1m`` [%].
+        """
+        motion, sweeps = way
+        rows = self.rows[(self.rows.motion == motion) & (self.rows.sweeps == sweeps)]
+        names = ["precision_1m", "precision_2m", "recall_1m"]
+        groups = rows.groupby("front_end", sort=False)[names]
+        chance = self.chance[self.chance.motion == motion].groupby("front_end", sort=False).chance_1m.mean()
+        return 100 * groups.mean().join(groups.std().add_suffix("_sd")).assign(chance_1m=chance)
+
+
+def compare_front_ends(
+    scans: Iterable[Pairs],
+    networks: Mapping[str, TrainedNetwork],
+    kept: Collection[int] = (),
+    *,
+    bf16: bool = False,
+) -> Comparison:
+    """Compare the points of every front end with the lidar points of real pairs.
+
+    Parameters
+    ----------
+    scans : iterable of mapping
+        Of each scan: what `load_scan_pairs` returns; read one by one.
+    networks : mapping
+        Name -> network.
+    kept : collection of int
+        Stamps of the scans whose points and images are kept [us].
+    bf16 : bool
+        Compute in bfloat16.
+
+    Returns
+    -------
+    comparison : Comparison
+        Without rows where there is no scan.
+    """
+    rows, chance, points, images = [], [], {}, {}
+    for pairs in scans:
+        for motion in MOTIONS:
+            if (motion, "turn") not in pairs:
+                continue
+            stamp = pairs[motion, "turn"].scan.stamp_us
+            clouds, drawn = front_end_points(pairs[motion, "turn"], networks, bf16)
+            if stamp in kept:
+                points[stamp, motion], images[stamp, motion] = clouds, drawn
+            own = {way: pair for way, pair in pairs.items() if way[0] == motion}
+            rows += [row for pair in own.values() for row in tabulate(pair, clouds)]
+            for way in {AS_IN_PAPER, BEST} & set(own):
+                for name, cloud in clouds.items():
+                    level = chance_level(cloud, own[way].lidar_points)["precision_1m"]
+                    chance.append((name, motion, level))
+    return Comparison(
+        pd.DataFrame(rows, columns=COLUMNS),
+        pd.DataFrame(chance, columns=["front_end", "motion", "chance_1m"]),
+        points,
+        images,
+    )
+
+
+def describe_comparison(comparison: Comparison, front_ends: Iterable[str]) -> dict[str, float]:
+    """Name the main percentages of a comparison for a text.
+
+    Parameters
+    ----------
+    comparison : Comparison
+        The comparison; it may be empty.
+    front_ends : iterable of str
+        Front ends.
+
+    Returns
+    -------
+    numbers : dict
+        ``<front end>_1m`` and ``<front end>_2m``: precision as in the paper, with "_" for "-"; ``chance_1m``,
+        the mean over all front ends; ``gain_sweeps`` and ``gain_motion``, the mean gain over the front ends
+        at 1 m by all sweeps of the turn, and by compensation alone. NaN without pairs.
+    """
+    rows = comparison.rows.astype({"precision_1m": float, "precision_2m": float})
+    means = 100 * rows.groupby(["motion", "sweeps", "front_end"])[["precision_1m", "precision_2m"]].mean()
+    own, at_1m = means.reindex([(*AS_IN_PAPER, name) for name in front_ends]), means.precision_1m
+    numbers = {
+        f"{name.replace('-', '_')}_{r}m": value
+        for (*_, name), row in own.iterrows()
+        for r, value in enumerate(row, start=1)
+    }
+    level = {
+        way: at_1m[[key[:2] == way for key in at_1m.index]].mean() for way in product(MOTIONS, REFERENCES)
+    }
+    return {
+        **numbers,
+        "chance_1m": 100 * comparison.chance.chance_1m.astype(float).mean(),
+        "gain_sweeps": level["none", "turn"] - level[AS_IN_PAPER],
+        "gain_motion": level["compensated", "nearest"] - level[AS_IN_PAPER],
+    }

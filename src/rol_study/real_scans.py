@@ -1,11 +1,9 @@
-"""Real radar scans on a real lidar map: precision of front ends, choice of thresholds,
-localization from wrong starts."""
+"""Points of real radar scans on a real lidar map and beside lidar sweeps in fog: precision, thresholds."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
-from types import SimpleNamespace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -13,17 +11,14 @@ import pandas as pd
 from scipy.spatial import cKDTree
 
 from rol.bev import image_to_points
-from rol.geometry import check_fields, compose, relative_pose
+from rol.geometry import compose
 from rol.lidar import crop_range, remove_ground
-from rol.mcl import MclSettings
 from rol.pairs import PairSettings
 from rol.pix2pix import TrainedNetwork
 from rol.radar import RangeCalibration
 from rol.similarity import fraction_within, nn_distances
 from rol_beyond.adaptation import AdaptationConfig, RealPair, adapt
 from rol_beyond.front_ends import MAX_RANGE_M, MIN_RANGE_M, detect_points, evaluate_on_map
-from rol_beyond.pipeline import FrontEnd, RobustLocalizer
-from rol_beyond.recovery import RecoveringFilter, RecoverySettings
 from rol_data.radiate import RANGE_RESOLUTION, RadiatePair, radiate_azimuths
 from rol_data.rall import RealScan
 
@@ -200,6 +195,44 @@ def evaluate_thresholds(
     return pd.DataFrame(rows, columns=["level", "n", "share_1m", "share_2m"])
 
 
+def tabulate_precision(table: pd.DataFrame) -> pd.DataFrame:
+    """Average the table of `evaluate_front_ends` over the scans, by front end.
+
+    Columns: ``within 1 m``, ``worst scan``, ``best scan`` (at 1 m), ``within 2 m``, ``chance, 1 m`` [%], and
+    ``number`` of points per scan (mean) and ``fewest``.
+    """
+    groups = table.groupby("points", sort=False)
+    columns = {
+        "within 1 m": 100 * groups.share_1m.mean(),
+        "worst scan": 100 * groups.share_1m.min(),
+        "best scan": 100 * groups.share_1m.max(),
+        "within 2 m": 100 * groups.share_2m.mean(),
+        "chance, 1 m": 100 * groups.chance_1m.mean(),
+        "number": groups.n.mean(),
+        "fewest": groups.n.min(),
+    }
+    return pd.DataFrame(columns)
+
+
+def describe_precision(table: pd.DataFrame, network: str) -> dict[str, float]:
+    """Summarize the table of `evaluate_front_ends` in percent, NaN without scans.
+
+    ``near_1m``, ``near_2m``, ``chance_1m`` of the network and ``raw_1m``, ``raw_2m`` of the raw peaks: means
+    over the scans.
+    """
+    names = ["share_1m", "share_2m", "chance_1m"]
+    means = 100 * table.groupby("points")[names].mean().astype(float).reindex([network, "raw"])
+    near_1m, near_2m, chance_1m = means.loc[network]
+    raw_1m, raw_2m, _ = means.loc["raw"]
+    return {
+        "near_1m": near_1m,
+        "near_2m": near_2m,
+        "chance_1m": chance_1m,
+        "raw_1m": raw_1m,
+        "raw_2m": raw_2m,
+    }
+
+
 # ---- RADIATE ----
 
 
@@ -246,7 +279,7 @@ def evaluate_pairs(
             rows.append(
                 {"points": name, "n": len(near), **fractions, "reached_1m": fraction_within(back, 1.0)}
             )
-    return pd.DataFrame(rows)
+    return pd.DataFrame(rows, columns=["points", "n", "share_1m", "share_2m", "reached_1m"])
 
 
 def adapt_to_fog(
@@ -258,257 +291,51 @@ def adapt_to_fog(
     return replace(network, generator=adapt(network.generator, real_pairs, rng, config, settings))
 
 
-# ---- localization ----
+def tabulate_fog(table: pd.DataFrame) -> pd.DataFrame:
+    """Average the table of `evaluate_pairs` over the pairs, by front end.
 
-
-@dataclass(frozen=True)
-class LocalizerSettings:
-    """Settings of the robust localizer.
-
-    Attributes
-    ----------
-    filter : MclSettings
-        Of the particle filter.
-    recovery : RecoverySettings
-        Of detection and relocalization.
-    density_radius_m : float
-        As in `rol_beyond.pipeline.RobustLocalizer`.
-
-    Raises
-    ------
-    ValueError
-        If a value is out of its range; the message names it.
+    Columns: ``within 1 m``, its standard deviation ``sd``, ``within 2 m``, ``recall, 1 m`` [%], and the
+    ``number`` of points.
     """
-
-    filter: MclSettings
-    recovery: RecoverySettings
-    density_radius_m: float
-
-    def __post_init__(self) -> None:
-        check_fields(self, {"[0, inf)": "density_radius_m"})
-
-
-def wrong_starts(off_m: float, off_deg: float, n_directions: int) -> np.ndarray:
-    """Give start poses off in all directions, each with both signs of the turn.
-
-    Parameters
-    ----------
-    off_m, off_deg : float
-        Distance and angle to the true pose [m, deg].
-    n_directions : int
-        Number of directions; the first is straight ahead.
-
-    Returns
-    -------
-    offsets : array, shape (2 * n_directions, 3)
-        Start in the true radar frame [m, m, rad]; the first is ahead and turned to the left.
-    """
-    angles = 2.0 * np.pi * np.arange(n_directions) / n_directions
-    turn = np.deg2rad(off_deg)
-    return np.array([(off_m * np.cos(a), off_m * np.sin(a), s * turn) for a in angles for s in (1, -1)])
-
-
-def cache_front_end(make_points: FrontEnd) -> FrontEnd:
-    """Remember the points of a scan and a twist, so that all starts share them."""
-    known: dict[Any, np.ndarray] = {}
-
-    def points_of(scan: Any, twist: tuple[float, float, float] | None) -> np.ndarray:
-        key = scan.stamp_us, twist
-        if key not in known:
-            known[key] = make_points(scan, twist)
-        return known[key]
-
-    return points_of
-
-
-def crop_map(
-    map_points: np.ndarray, map_tree: cKDTree, poses: np.ndarray, reach_m: float = 120.0
-) -> np.ndarray:
-    """Keep the points of a map near some poses, shape (n, 2) [m], in their order."""
-    around = np.unique(np.concatenate(map_tree.query_ball_point(poses[:, :2], reach_m)))
-    return map_points[around.astype(int)]
-
-
-def localize_from_starts(
-    scans: Sequence[RealScan],
-    front_end: FrontEnd,
-    map_points: np.ndarray,
-    starts: np.ndarray,
-    settings: LocalizerSettings,
-    seeds: Sequence[int],
-) -> np.ndarray:
-    """Localize consecutive scans on a map from several starts.
-
-    Parameters
-    ----------
-    scans : sequence of RealScan
-        The scans, in the order of time.
-    front_end : callable
-        As in `rol_beyond.pipeline.RobustLocalizer`.
-    map_points : array, shape (m, 2)
-        Points of the map [m].
-    starts : array, shape (s, 3)
-        Poses T_map_radar with which the filter begins [m, m, rad].
-    settings : LocalizerSettings
-        Of the localizer.
-    seeds : sequence of int
-        Seeds of the runs from each start.
-
-    Returns
-    -------
-    poses : array, shape (s * len(seeds), len(scans), 3)
-        Estimates, the runs of one start after the other [m, m, rad].
-    """
-    grid = settings.filter.measurement.build_grid(map_points)
-    runs = []
-    for start in starts:
-        for seed in seeds:
-            rng = np.random.default_rng(seed)
-            recovering = RecoveringFilter(
-                map_points, start, settings.filter, settings.recovery, rng, grid=grid
-            )
-            radius = settings.density_radius_m
-            localizer = RobustLocalizer(recovering, front_end, density_radius_m=radius)
-            runs.append([localizer.step(scan).pose for scan in scans])
-    return np.array(runs)
-
-
-def position_and_heading_errors(poses: np.ndarray, truth: np.ndarray) -> np.ndarray:
-    """Compute the distance [m] and the angle [deg] to the true poses, shape (..., 2);
-    leading axes broadcast."""
-    x, y, yaw = np.moveaxis(relative_pose(truth, poses), -1, 0)
-    return np.stack([np.hypot(x, y), np.rad2deg(np.abs(yaw))], axis=-1)
-
-
-def summarize_starts(
-    errors: Sequence[np.ndarray], first_scan: int, limits: Sequence[float]
-) -> dict[str, Any]:
-    """Summarize errors over runs from several starts.
-
-    Parameters
-    ----------
-    errors : sequence of array, shape (s, k, 2)
-        Errors of each group of scans [m, deg]; the groups may differ in length.
-    first_scan : int
-        Scan, counted from 1, from which on the runs are judged.
-    limits : sequence of float
-        Largest errors allowed [m, deg].
-
-    Returns
-    -------
-    summary : dict
-        ``median``: medians per scan, shape (k, 2); ``worst``: largest errors from ``first_scan`` on, shape
-        (2,); ``met``: fraction of the runs that stay within the limits from then on. NaN where no group is
-        long enough.
-    """
-    longest = max(e.shape[1] for e in errors)
-    median = [
-        np.median(np.concatenate([e[:, i] for e in errors if e.shape[1] > i]), axis=0) for i in range(longest)
-    ]
-    later = [e[:, first_scan - 1 :] for e in errors if e.shape[1] >= first_scan]
-    worst = np.max([e.max(axis=(0, 1)) for e in later], axis=0) if later else np.full(2, np.nan)
-    met = float(np.mean([(e <= limits).all(axis=(1, 2)) for e in later])) if later else np.nan
-    return {"median": np.array(median), "worst": worst, "met": met}
-
-
-def tabulate_starts(summaries: Mapping[str, Mapping[str, Any]], n_scans: int = 11) -> pd.DataFrame:
-    """Tabulate summaries of `summarize_starts`, a row per scan and two columns per summary.
-
-    Parameters
-    ----------
-    summaries : mapping of str to mapping
-        Label -> summary.
-    n_scans : int
-        Largest number of scans shown.
-
-    Returns
-    -------
-    table : pandas.DataFrame
-        Medians per scan, and the worst errors of the scans that are judged [m, deg].
-    """
+    groups = table.groupby("points", sort=False)
     columns = {
-        f"{label} [{unit}]": [*summary["median"][:n_scans, k], summary["worst"][k]]
-        for label, summary in summaries.items()
-        for k, unit in enumerate(("m", "deg"))
+        "within 1 m": 100 * groups.share_1m.mean(),
+        "sd": 100 * groups.share_1m.std(),
+        "within 2 m": 100 * groups.share_2m.mean(),
+        "recall, 1 m": 100 * groups.reached_1m.mean(),
+        "number": groups.n.mean(),
     }
-    n_rows = len(next(iter(columns.values()))) - 1
-    return pd.DataFrame(columns, [*(f"scan {i + 1}, median" for i in range(n_rows)), "worst of those judged"])
+    return pd.DataFrame(columns)
 
 
-def localize_points(
-    points: np.ndarray,
-    pose: np.ndarray,
-    map_points: np.ndarray,
-    offsets: np.ndarray,
-    settings: LocalizerSettings,
-    seed: int,
-) -> np.ndarray:
-    """Localize one cloud by one update of the filter from several starts.
-
-    Parameters
-    ----------
-    points : array, shape (n, 2)
-        Points in the radar frame [m].
-    pose : array, shape (3,)
-        True pose [m, m, rad].
-    map_points : array, shape (m, 2)
-        Points of the map [m].
-    offsets : array, shape (s, 3)
-        Starts in the true radar frame, from `wrong_starts` [m, m, rad].
-    settings : LocalizerSettings
-        Of the localizer.
-    seed : int
-        Seed of each run.
-
-    Returns
-    -------
-    errors : array, shape (s, 2)
-        Distance and angle to the true pose [m, deg].
-    """
-    scan = SimpleNamespace(stamp_us=0)
-    starts = compose(pose, offsets)
-    found = localize_from_starts([scan], lambda *_: points, map_points, starts, settings, [seed])
-    return position_and_heading_errors(found[:, 0], pose)
+def describe_fog(table: pd.DataFrame, network: str) -> dict[str, float]:
+    """Summarize the table of `evaluate_pairs` in percent, NaN without pairs: ``fog_1m`` and ``fog_2m`` of the
+    network, ``fog_raw_1m`` and ``fog_raw_2m`` of the raw peaks."""
+    means = table.groupby("points")[["share_1m", "share_2m"]].mean().astype(float)
+    means = 100 * means.reindex([network, "raw"])
+    rows = {"fog": means.loc[network], "fog_raw": means.loc["raw"]}
+    return {f"{name}_{r}m": row[f"share_{r}m"] for name, row in rows.items() for r in (1, 2)}
 
 
-def evaluate_turn(
-    scan: RealScan,
-    front_ends: Mapping[str, FrontEnd],
-    variants: Mapping[str, tuple[bool, float]],
-    map_points: np.ndarray,
-    localize: Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray],
-) -> tuple[pd.DataFrame, dict[tuple[str, str], np.ndarray]]:
-    """Evaluate a scan with and without motion compensation, and with turned azimuths.
+def describe_adaptation(curves: Mapping[str, pd.DataFrame], level: float) -> dict[str, float]:
+    """Summarize curves before and after an adaptation at one threshold.
 
     Parameters
     ----------
-    scan : RealScan
-        Scan with pose and twist.
-    front_ends : mapping of str to callable
-        Front ends by name, as in `rol_beyond.pipeline.RobustLocalizer`.
-    variants : mapping of str to (bool, float)
-        Name -> whether motion is compensated, and the angle added to the azimuths [rad].
-    map_points : array, shape (m, 2)
-        Points of the map [m].
-    localize : callable
-        Takes points, the true pose and the map and returns errors, shape (s, 2) [m, deg]; see
-        `localize_points`.
+    curves : mapping of str to pandas.DataFrame
+        "before" and "adapted" -> table of `evaluate_thresholds`; one that is missing gives NaN.
+    level : float
+        Threshold.
 
     Returns
     -------
-    table : pandas.DataFrame
-        One row per variant and front end: fractions ``share_1m`` and ``share_2m`` at the true pose; medians
-        ``m`` and ``deg`` and the largest ``worst_m`` of the errors.
-    points : dict
-        (variant, front end) -> points, shape (n, 2) [m].
+    numbers : dict
+        ``<name>_1m`` [%] and ``<name>_n`` points per scan.
     """
-    points, rows, tree = {}, {}, cKDTree(map_points)
-    for variant, (is_compensated, turn) in variants.items():
-        turned = replace(scan, azimuths=scan.azimuths + turn)
-        for name, make_points in front_ends.items():
-            cloud = points[variant, name] = make_points(turned, scan.twist if is_compensated else None)
-            errors = localize(cloud, scan.pose, map_points)
-            shares = evaluate_on_map(cloud, scan.pose, tree)
-            middle = dict(zip(("m", "deg"), np.median(errors, axis=0), strict=True))
-            rows[variant, name] = {**shares, **middle, "worst_m": errors[:, 0].max()}
-    return pd.DataFrame.from_dict(rows, orient="index").drop(columns="n"), points
+    numbers = {}
+    for name in ("before", "adapted"):
+        row = {"share_1m": np.nan, "n": np.nan}
+        if name in curves and len(curves[name]):
+            row = curves[name].groupby("level").mean().loc[level]
+        numbers |= {f"{name}_1m": 100 * row["share_1m"], f"{name}_n": row["n"]}
+    return numbers

@@ -479,3 +479,38 @@ def register_submap(
         residuals_along(sweeps.clouds[::8], path[::8], map_points),
         np.column_stack(sides),
     )
+
+
+def describe_submap(
+    registered: RegisteredSubmap | None,
+    segments: pd.DataFrame | None,
+    changes: Changes | None,
+    sharpest_deg: float = np.nan,
+) -> dict[str, float]:
+    """Name the results on a submap for a text; NaN without one.
+
+    Parameters
+    ----------
+    registered, segments, changes
+        From `register_submap`, `register_segments` and `find_changes`.
+    sharpest_deg : float
+        From `sharpest_angle` [deg].
+
+    Returns
+    -------
+    numbers : dict
+        ``submap_spread_mm`` between starts; ``submap_residual_m``, median distance of sweeps to the map;
+        ``segment_low_m`` and ``segment_high_m``, smallest and largest shift forward of segments;
+        ``submap_off_m`` and ``submap_worst_m``, mean and largest distance to the given poses, ``submap_deg``,
+        their mean heading difference; ``changed_new`` and ``changed_gone`` [%]; ``sharpest_deg``.
+    """
+    names = ["submap_spread_mm", "submap_residual_m", "segment_low_m", "segment_high_m", "submap_off_m"]
+    names += ["submap_worst_m", "submap_deg", "changed_new", "changed_gone", "sharpest_deg"]
+    if registered is None:
+        return dict.fromkeys(names, np.nan)
+    forward, (distance, heading) = segments.forward_m, registered.differences.T[2:]
+    n_new, n_gone = len(changes.new), len(changes.gone)
+    values = [1000 * registered.spread_m, np.median(registered.residuals_m), forward.min(), forward.max()]
+    values += [distance.mean(), distance.max(), heading.mean()]
+    values += [100 * n_new / (n_new + len(changes.same)), 100 * n_gone / (n_gone + len(changes.confirmed))]
+    return dict(zip(names, [*map(float, values), sharpest_deg], strict=True))

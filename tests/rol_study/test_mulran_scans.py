@@ -59,3 +59,12 @@ def test_the_real_scans(real_root: Path) -> None:
     assert (
         study.frame.shape == (2, 3) and study.frame[0, 0] < -0.8
     )  # the published pose is ahead of the radar
+    numbers = mulran_scans.describe_mulran(study, "cfar")
+    assert numbers["mulran_raw_1m"] == 100 * raw.share_1m and numbers["best_offset_m"] == pytest.approx(-0.31)
+    assert numbers["frame_first_m"] == -study.frame[0, 0]
+
+
+def test_without_scans_there_are_no_numbers() -> None:
+    numbers = mulran_scans.describe_mulran(None, "unet")
+    assert {"mulran_1m", "mulran_raw_map_1m", "frame_deg"} <= set(numbers)
+    assert np.isnan(list(numbers.values())).all()

@@ -1,36 +1,29 @@
-"""Comparison of real pairs: time of a sweep, calibration, ground and kinds of points, on data made by hand."""
+"""Comparison of real pairs: alignment, ground and kinds of points, on data made by hand."""
 
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 from scipy.spatial import cKDTree
 
 from rol.geometry import transform_points
-from rol.lidar import relate_sensors
-from rol.oxford import EXTRINSICS, FIRE_HEIGHT, RadarOdometry, RadarScan
-from rol.radar import MEASURED, ScanMotion, peaks_to_points
-from rol_data.oxford_pairs import PairedScan, Sweep, find_pairs
-from rol_sim.session.oxford_files import save_radar_odometry, save_velodyne_binary
+from rol.oxford import OxfordError, RadarScan
+from rol_data.oxford_pairs import PairedScan, RealPairs, find_pairs
+from rol_sim.session.oxford_files import save_radar, save_timestamps, save_velodyne_binary
+from rol_study import real_pairs
+from rol_study.real_calibration import locate_stamp, measure_stamps
 from rol_study.real_pairs import (
     COLUMNS,
-    Calibration,
     Pair,
-    RadarAgreement,
     chance_level,
     compare_points,
     describe_points,
     distance_from_path,
     fit_ground,
-    fit_ranges,
-    fit_span,
     load_path,
     load_scan_pairs,
-    locate_stamp,
-    measure_stamps,
-    measure_walls,
-    sweep_consistency,
     tabulate,
     tabulate_corrected,
     tabulate_kinds,
@@ -56,93 +49,6 @@ def make_pair(cloud: np.ndarray, radar: RadarScan | None = None, twist: tuple = 
 
 def lift(points: np.ndarray, z: float = 0.0) -> np.ndarray:
     return np.column_stack([points, np.full(len(points), z), np.zeros(len(points))])
-
-
-@pytest.mark.parametrize(("place", "weights"), [(0.0, (1, 0)), (0.5, (0.5, 0.5)), (1.0, (0, 1))])
-def test_place_of_a_stamp_follows_from_sweeps_of_different_length(place: float, weights: tuple) -> None:
-    rng = np.random.default_rng(1)
-    turned = 360.0 + rng.choice([-1.0, 3.0], 200)
-    durations = turned / 360.0 * 50.0
-    intervals = weights[0] * durations + weights[1] * np.roll(durations, -1) + rng.normal(0.0, 0.05, 200)
-    intervals[50] += 20.0  # a sweep was lost
-    found, error, n = locate_stamp(intervals, turned)
-    assert found == pytest.approx(place, abs=4.0 * error) and error < 0.03 and n == 197
-
-
-def test_calibration_that_made_a_scan_is_found() -> None:
-    rng = np.random.default_rng(2)
-    rows, bins = rng.integers(0, 400, 900), rng.integers(200, 1100, 900)
-    radar = make_radar(rows, bins)
-    motion = ScanMotion(TWIST)
-    points = peaks_to_points(rows, bins, radar.azimuths, calibration=MEASURED, motion=motion)
-    shifted = transform_points((0.3, -0.2, np.deg2rad(0.6)), points)  # where the lidar has them
-    names = ["rotation_deg", "forward_m", "left_m"]
-    best, errors = RadarAgreement([make_pair(lift(shifted), radar)]).fit(names)
-    assert best.rotation_deg == pytest.approx(-0.6, abs=0.1) and set(errors) == set(names)
-    assert best.forward_m == pytest.approx(-0.3, abs=0.08) and best.left_m == pytest.approx(0.2, abs=0.08)
-    agreement = RadarAgreement([make_pair(lift(points), radar)])
-    best, _ = agreement.fit(["delay_s", "doppler_s"], Calibration(doppler_s=0.06))
-    assert best.delay_s == pytest.approx(0.0, abs=0.006) and best.doppler_s == pytest.approx(0.049, abs=0.006)
-    best, _ = agreement.fit(["resolution_m", "offset_m"], Calibration(resolution_m=0.0436, offset_m=-0.2))
-    assert best.resolution_m == pytest.approx(0.0438, abs=1e-4)
-    assert best.offset_m == pytest.approx(-0.31, abs=0.05)
-    assert agreement.scores(Calibration()) > agreement.scores(replace(Calibration(), left_m=0.6))
-
-
-def test_ranges_are_fitted_to_walls() -> None:
-    pairs = []
-    for first in (6.0, 7.0, 8.0):
-        bins = np.rint((np.linspace(first, 40.0, 400) + 0.4) / 0.0436 - 0.5).astype(int)
-        radar = make_radar(np.repeat(np.arange(400), 9), (bins[:, None] + np.arange(-4, 5)).ravel())
-        ranges, azimuths = (bins + 0.5) * 0.0436 - 0.4, radar.azimuths
-        wall = ranges[:, None] * np.column_stack([np.cos(azimuths), np.sin(azimuths)])
-        cloud = np.vstack([lift(wall, z) for z in np.arange(-0.9, 2.0, 0.3)])
-        pairs.append(make_pair(cloud, radar, (0.0, 0.0, 0.0)))
-    walls = measure_walls(pairs, Calibration())
-    values, errors = fit_ranges(walls)
-    assert len(walls) > 1000 and values == pytest.approx([0.0436, -0.4], abs=2e-3)
-    assert (errors < 2e-3).all()
-    low = [replace(pair, cloud=pair.cloud[pair.cloud[:, 2] < 0.0]) for pair in pairs]  # a kerb is no wall
-    assert len(measure_walls(low, Calibration())) == 0
-    assert np.isnan(fit_ranges(walls[:0])).all()
-
-
-def test_duration_of_a_sweep_that_made_the_sweeps_is_found(tmp_path: Path) -> None:
-    """Poles seen from a vehicle at 10 m/s by a lidar that turns once in 50 ms."""
-    rng = np.random.default_rng(4)
-    poles = np.column_stack([rng.uniform(-25.0, 45.0, 900), rng.uniform(-25.0, 25.0, 900)])
-    lidar = np.linalg.inv(relate_sensors(EXTRINSICS["radar"], EXTRINSICS["velodyne_left"]))
-    start = 1_547_131_046_000_000
-    stamps = start + 50_000 * np.arange(16)
-    sweeps = []
-    for stamp in stamps:
-        seconds = np.zeros(len(poles))
-        for _ in range(6):
-            x = poles[:, 0] - 10.0 * ((stamp - start) / 1e6 + seconds)
-            seen = np.column_stack([x, poles[:, 1], np.zeros(len(poles)), np.ones(len(poles))]) @ lidar.T
-            clockwise = -np.arctan2(seen[:, 1], seen[:, 0])
-            seconds = 0.05 * np.mod(clockwise - np.pi / 2.0, 2.0 * np.pi) / (2.0 * np.pi)
-        order = np.argsort(seconds)
-        level = np.hypot(seen[:, 0], seen[:, 1])[order]
-        lasers = [
-            np.column_stack([seen[order, :2], FIRE_HEIGHT + level * np.tan(up), np.ones(len(order))])
-            for up in (0.0, 0.0232, 0.0466)
-        ]
-        path = tmp_path / f"{stamp}.bin"
-        save_velodyne_binary(path, np.vstack(lasers).astype(np.float32))
-        sweeps.append(Sweep(path, "velodyne_left", int(stamp)))
-    first = start + np.arange(-2, 6) * 250_000
-    moved = np.tile([2.5, 0.0, 0.0, 0.0, 0.0, 0.0], (7, 1))
-    mid = first + 125_000
-    odometry = RadarOdometry(mid[1:], mid[:-1], first[1:], first[:-1], moved)
-    save_radar_odometry(tmp_path / "radar_odometry.csv", odometry)
-    spans = np.arange(-0.05, 0.151, 0.025)
-    apart = sweep_consistency(sweeps, tmp_path / "radar_odometry.csv", spans, lag=10, n_pairs=4)
-    span, error = fit_span(spans, apart, np.random.default_rng(5))
-    assert span == pytest.approx(0.05, abs=0.01) and error < 0.02
-    assert spans[apart.mean(axis=0).argmin()] == pytest.approx(0.05)
-    none = sweep_consistency(sweeps[:5], tmp_path / "radar_odometry.csv", spans)
-    assert none.shape == (0, len(spans)) and np.isnan(fit_span(spans, none, np.random.default_rng(5))).all()
 
 
 def test_plane_of_the_street_is_fitted_below_cars_and_walls() -> None:
@@ -241,3 +147,129 @@ def test_real_pairs_agree_and_a_stamp_is_the_beginning_of_its_sweep(real_root: P
     assert abs(compensated[0]) < 0.5 < abs(recorded[0])
     rows = tabulate(pairs["compensated", "turn"], {"same": pairs["compensated", "turn"].lidar_points})
     assert list(rows[0]) == COLUMNS and rows[0]["precision_1m"] == rows[0]["recall_1m"] == 1.0
+
+
+def test_scans_are_counted_with_and_without_velocity() -> None:
+    scans = [PairedScan(Path("1.png"), t, t, TWIST, None, None) for t in (1_000_000, 1_250_000)]
+    numbers = real_pairs.describe_scans(RealPairs(scans, [], []))
+    assert numbers == pytest.approx(
+        {"n_scans": 2, "n_sweeps": 0, "seconds": 0.5, "distance": 2.0, "speed_min": 8.0, "speed_max": 8.0}
+    )
+    assert np.isnan(real_pairs.describe_scans(RealPairs([], [], []))["speed_max"])
+
+
+def test_misalignment_is_averaged_over_the_nearest_sweeps() -> None:
+    rows = [("none", "nearest", 8.0, -0.8, 0.0), ("none", "nearest", 4.0, -0.6, 0.0)]
+    rows += [("none", "turn", 8.0, 9.0, 0.0), ("compensated", "nearest", 8.0, 0.1, 0.0)]
+    table = pd.DataFrame(rows, columns=["motion", "sweeps", "speed_mps", "forward_m", "left_m"])
+    numbers = real_pairs.describe_misalignment(table)
+    assert numbers == pytest.approx({"lag_none": 0.7, "lag_per_speed": 0.125, "lag_compensated": 0.1})
+    empty = real_pairs.tabulate_misalignment([])
+    assert np.isnan(list(real_pairs.describe_misalignment(empty).values())).all()
+
+
+def test_ground_is_measured_with_its_margin() -> None:
+    rng = np.random.default_rng(3)
+    xy = rng.uniform(-25.0, 25.0, (4000, 2))
+    street = lift(xy, -2.0)
+    street[:, 2] += 0.02 * xy[:, 0]
+    wall = lift(np.column_stack([np.linspace(-20, 20, 1000), np.full(1000, 9.0)]), 1.0)
+    ground = real_pairs.measure_ground([make_pair(np.vstack([street, wall]))], -1.5)
+    assert ground.numbers["ground"] == pytest.approx(2.0, abs=0.01)
+    assert ground.numbers["slope"] == pytest.approx(2.0, abs=0.1)
+    assert ground.numbers["margin"] == pytest.approx(0.5, abs=0.01)
+    assert ground.numbers["kept"] == pytest.approx(20.0, abs=0.5) and ground.kept[0] > ground.kept[-1]
+    assert np.isnan(list(real_pairs.measure_ground([], -1.5).numbers.values())).all()
+
+
+def test_front_ends_are_compared_in_every_way(monkeypatch: pytest.MonkeyPatch) -> None:
+    wall = np.column_stack([np.arange(-20.0, 20.0, 0.25), np.full(160, 8.125)])
+    far = wall + (0.0, 1.5)
+    ways = {
+        (motion, sweeps): replace(make_pair(lift(wall, 1.0)), motion=motion, sweeps=sweeps)
+        for motion in real_pairs.MOTIONS
+        for sweeps in real_pairs.REFERENCES
+    }
+    clouds = {"none": far, "compensated": wall}
+    monkeypatch.setattr(
+        real_pairs, "front_end_points", lambda pair, networks, bf16: ({"some": clouds[pair.motion]}, {})
+    )
+    comparison = real_pairs.compare_front_ends([ways], {}, kept={1})
+    assert len(comparison.rows) == 4 and len(comparison.chance) == 2 and len(comparison.points) == 2
+    assert comparison.average(real_pairs.AS_IN_PAPER).precision_1m["some"] == 0.0
+    assert comparison.average(real_pairs.BEST).loc["some", ["precision_1m", "recall_1m"]].tolist() == [
+        100,
+        100,
+    ]
+    numbers = real_pairs.describe_comparison(comparison, ["some", "other"])
+    assert (numbers["some_1m"], numbers["some_2m"], numbers["gain_sweeps"]) == (0.0, 100.0, 0.0)
+    assert numbers["gain_motion"] == 100.0 and np.isnan(numbers["other_1m"])
+    empty = real_pairs.compare_front_ends([], {})
+    assert len(empty.average(real_pairs.BEST)) == 0
+    assert np.isnan(list(real_pairs.describe_comparison(empty, ["some"]).values())).all()
+
+
+def test_the_ceiling_is_that_of_the_nearest_sweep() -> None:
+    rows = {"lidar, nearest": [0.8, 0.9, np.nan], "cfar": [0.5, 0.6, 0.4], "unet": [0.7, 0.8, 0.65]}
+    columns = ["share_1m", "share_2m", "sweep_1m"]
+    table = pd.DataFrame.from_dict(rows, orient="index", columns=columns)
+    numbers = real_pairs.describe_ceiling(table, "unet")
+    assert numbers == pytest.approx(
+        {
+            "ceiling_1m": 80.0,
+            "ceiling_2m": 90.0,
+            "on_map": 70.0,
+            "gain_min": 5.0,
+            "gain_max": 10.0,
+            "paper_min": 45.0,
+            "paper_max": 50.0,
+        }
+    )
+    assert np.isnan(list(real_pairs.describe_ceiling(table[:0], "unet").values())).all()
+
+
+def test_tables_without_pairs_are_empty() -> None:
+    assert np.isnan(list(real_pairs.describe_kinds(tabulate_kinds([], []), "unet").values())).all()
+    corrected = tabulate_corrected([], [], 0.5, 0.1)
+    assert np.isnan(list(real_pairs.describe_corrected(corrected, "unet").values())).all()
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """One scan with the two sweeps of its turn that a list names, and a sweep that it does not name."""
+    start = 1_547_131_046_000_000
+    none = np.zeros(0, dtype=int)
+    scan = make_radar(none, none)
+    save_radar(tmp_path / f"one/{start}.png", replace(scan, row_stamps_us=start + np.arange(400) * 625))
+    cloud = lift(np.column_stack([np.linspace(-9, 9, 64), np.full(64, 8.0)]), 1.0).astype(np.float32)
+    stamps = start + np.array([10_000, 60_000])
+    for stamp in (*stamps, start + 70_000):
+        save_velodyne_binary(tmp_path / f"two/binaries/{stamp}.bin", cloud)
+    save_timestamps(tmp_path / "two/velodyne_left.timestamps", stamps)
+    return tmp_path
+
+
+def test_a_sweep_that_no_list_names_is_not_compared(folder: Path) -> None:
+    found = find_pairs(folder)
+    pairs = load_scan_pairs(found, found.scans[0])
+    assert set(pairs) == {("none", "nearest"), ("none", "turn")}  # the velocity is unknown
+    assert len(pairs["none", "turn"].cloud) == 2 * 64 and "are not in velodyne_left" in found.faults[0]
+
+
+def test_a_truncated_file_is_named(folder: Path) -> None:
+    found = find_pairs(folder)
+    sweep = found.sweeps[1].path
+    sweep.write_bytes(sweep.read_bytes()[:-7])
+    with pytest.raises(OxfordError, match=f"{sweep.name}.*truncated"):
+        load_scan_pairs(found, found.scans[0])
+    scan = found.scans[0].path
+    scan.write_bytes(scan.read_bytes()[:2000])
+    with pytest.raises(OxfordError, match=scan.name):
+        load_scan_pairs(found, found.scans[0])
+
+
+def test_a_sweep_that_is_lost_while_it_is_read_is_named(folder: Path) -> None:
+    found = find_pairs(folder)
+    found.sweeps[0].path.unlink()
+    with pytest.raises(OxfordError, match=found.sweeps[0].path.name):
+        load_scan_pairs(found, found.scans[0])

@@ -1,19 +1,17 @@
-"""Real scans on a map: chance, thresholds, pairs, starts, and the variants of a turn; all on small made-up scans."""
+"""Real scans on a map and beside sweeps in fog: chance, thresholds, pairs; all on small made-up scans."""
 
 from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
+import pandas as pd
 import pytest
 from scipy.spatial import cKDTree
 
-from rol.mcl import MclSettings
-from rol_beyond.recovery import RecoverySettings
 from rol_data.rall import RealScan
 from rol_study import real_scans
 
 WALL = np.column_stack([np.linspace(-20.0, 20.0, 200), np.full(200, 8.0)])
-ROOM = np.vstack([WALL, WALL[:60] * (1, -1), WALL[:, ::-1] + (12.0, -8.0)])
 
 
 def make_scan(stamp_us: int = 1) -> RealScan:
@@ -80,75 +78,32 @@ def test_pairs_are_compared_within_the_reach_in_both_directions() -> None:
     assert row["reached_1m"] == 0.5
 
 
-def test_starts_are_off_in_all_directions_with_both_turns() -> None:
-    starts = real_scans.wrong_starts(5.0, 3.0, 4)
-    np.testing.assert_allclose(np.hypot(starts[:, 0], starts[:, 1]), 5.0)
-    np.testing.assert_allclose(starts[0], [5.0, 0.0, np.deg2rad(3.0)], atol=1e-12)
-    np.testing.assert_allclose(starts[1], [5.0, 0.0, -np.deg2rad(3.0)], atol=1e-12)
-    np.testing.assert_allclose(starts[2, :2], [0.0, 5.0], atol=1e-12)
-
-
-def test_errors_are_metres_and_degrees() -> None:
-    poses = np.array([[[3.0, 4.0, 0.1], [0.0, 0.0, -np.pi]], [[0.0, 0.0, 0.0], [0.0, 0.0, np.pi]]])
-    errors = real_scans.position_and_heading_errors(poses, np.array([[0.0, 0.0, 0.0], [0.0, 0.0, np.pi]]))
-    np.testing.assert_allclose(
-        errors, [[[5.0, np.rad2deg(0.1)], [0.0, 0.0]], [[0.0, 0.0], [0.0, 0.0]]], atol=1e-9
+def test_precision_is_averaged_and_named() -> None:
+    networks = {"unet": make_network()}
+    table, _ = real_scans.evaluate_front_ends(
+        [make_scan(1), make_scan(2)], networks, "unet", cKDTree(WALL), generate
     )
+    means = real_scans.tabulate_precision(table)
+    assert means.loc["unet", ["within 1 m", "worst scan", "fewest"]].tolist() == [100.0, 100.0, 4.0]
+    numbers = real_scans.describe_precision(table, "unet")
+    assert numbers["near_1m"] == 100.0 and numbers["raw_1m"] == means.loc["raw", "within 1 m"]
+    assert np.isnan(list(real_scans.describe_precision(table[:0], "unet").values())).all()
+    empty, _ = real_scans.evaluate_front_ends([], networks, "unet", cKDTree(WALL), generate)
+    assert np.isnan(list(real_scans.describe_precision(empty, "unet").values())).all()
 
 
-def test_runs_are_judged_from_a_scan_on() -> None:
-    errors = np.zeros((4, 3, 2))
-    errors[:, 0] = [[9.0, 9.0], [1.0, 1.0], [3.0, 3.0], [5.0, 5.0]]
-    errors[2, 2] = [0.7, 0.1]
-    summary = real_scans.summarize_starts([errors], 2, [0.6, 0.6])
-    np.testing.assert_allclose(summary["median"][0], 4.0)
-    np.testing.assert_allclose(summary["worst"], [0.7, 0.1])
-    assert summary["met"] == 0.75
-    short = real_scans.summarize_starts([errors[:, :1]], 2, [0.6, 0.6])
-    assert np.isnan(short["worst"]).all() and np.isnan(short["met"])
-    table = real_scans.tabulate_starts({"unet": summary})
-    assert table.shape == (4, 2) and table["unet [m]"].tolist() == [4.0, 0.0, 0.0, 0.7]
-
-
-def test_points_of_a_scan_and_a_twist_are_made_once() -> None:
-    calls = []
-    points_of = real_scans.cache_front_end(lambda scan, twist: calls.append(twist) or WALL)
-    for _ in range(3):
-        for scan in (make_scan(1), make_scan(2)):
-            points_of(scan, None)
-            points_of(scan, (1.0, 0.0, 0.0))
-    assert len(calls) == 4
-
-
-def make_settings() -> real_scans.LocalizerSettings:
-    """Few particles around a start that is nearly right."""
-    settings = MclSettings(n_particles=2000, start_spread_m=1.0, start_spread_yaw_rad=0.05)
-    return real_scans.LocalizerSettings(settings, RecoverySettings(reference_contrast=0.2), 0.0)
-
-
-def test_a_cloud_is_localized_from_every_start() -> None:
-    pose = np.array([1.0, -2.0, 0.1])
-    c, s = np.cos(0.1), np.sin(0.1)
-    cloud = (ROOM - pose[:2]) @ np.array([[c, -s], [s, c]])
-    starts = real_scans.wrong_starts(1.0, 2.0, 3)
-    errors = real_scans.localize_points(cloud, pose, ROOM, starts, make_settings(), 1)
-    assert errors.shape == (6, 2)
-    assert np.median(errors[:, 0]) < 0.4 and np.median(errors[:, 1]) < 1.0
-
-
-def test_variants_of_a_turn_get_the_twist_and_the_azimuths() -> None:
-    seen = []
-
-    def front_end(scan, twist):
-        seen.append((twist, scan.azimuths[0]))
-        return WALL if twist else WALL + (0.0, 1.5)
-
-    def localize(points, pose, map_points):
-        return np.array([[points[0, 1] - 8.0, 1.0], [0.0, 2.0]])
-
-    variants = {"recorded": (False, 0.0), "turned": (True, -0.1)}
-    table, points = real_scans.evaluate_turn(make_scan(), {"raw": front_end}, variants, WALL, localize)
-    assert seen == [(None, 0.0), ((4.0, 0.0, 0.5), pytest.approx(-0.1))]
-    assert table.loc[("recorded", "raw"), ["share_1m", "share_2m", "worst_m"]].tolist() == [0.0, 1.0, 1.5]
-    assert table.loc[("turned", "raw"), ["share_1m", "m", "deg"]].tolist() == [1.0, 0.0, 1.5]
-    assert set(points) == set(table.index)
+def test_fog_and_adaptation_are_named() -> None:
+    points = {"raw": np.array([[10.5, 0.0]]), "unet": np.array([[13.0, 0.0]])}
+    table = real_scans.evaluate_pairs([points], [np.array([[10.0, 0.0]])], 20.0)
+    assert real_scans.describe_fog(table, "unet") == {
+        "fog_1m": 0.0,
+        "fog_2m": 0.0,
+        "fog_raw_1m": 100.0,
+        "fog_raw_2m": 100.0,
+    }
+    assert real_scans.tabulate_fog(table)["recall, 1 m"].tolist() == [100.0, 0.0]
+    empty = real_scans.evaluate_pairs([], [], 20.0)
+    assert np.isnan(list(real_scans.describe_fog(empty, "unet").values())).all()
+    curve = pd.DataFrame({"level": [10, 20], "n": [5, 2], "share_1m": [0.5, 1.0], "share_2m": [1.0, 1.0]})
+    numbers = real_scans.describe_adaptation({"before": curve}, 20)
+    assert (numbers["before_1m"], numbers["before_n"]) == (100.0, 2) and np.isnan(numbers["adapted_1m"])

@@ -4,6 +4,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 
 from rol.geometry import compose, exp, relative_pose, transform_points, transform_points_3d
@@ -176,3 +177,11 @@ def test_a_submap_is_registered_from_several_starts(root: Path) -> None:
     assert found.spread_m < 0.05 and found.residuals_m.max() < 0.3
     np.testing.assert_allclose(found.differences[:, 2], 0.3, atol=0.05)
     np.testing.assert_allclose(found.path[0], truth, atol=0.05)
+    segments = pd.DataFrame({"forward_m": [-0.2, 0.1]})
+    changes = real_submap.Changes(*(np.zeros((n, 2)) for n in (3, 1, 4, 1, 7)))
+    numbers = real_submap.describe_submap(found, segments, changes, -0.3)
+    assert numbers["submap_worst_m"] == found.differences[:, 2].max() and numbers["sharpest_deg"] == -0.3
+    assert (numbers["segment_low_m"], numbers["segment_high_m"]) == (-0.2, 0.1)
+    assert (numbers["changed_new"], numbers["changed_gone"]) == (25.0, 20.0)
+    none = real_submap.describe_submap(None, None, None)
+    assert set(none) == set(numbers) and np.isnan(list(none.values())).all()
