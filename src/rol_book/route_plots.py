@@ -131,8 +131,9 @@ def draw_quality(
         ax.axhspan(scale * min(printed[name]), scale * max(printed[name]), **PRINTED)
         ax.set(xlabel="within 1 m of the map [%]", ylabel=words, xlim=(28.0, 82.0))
         ax.set_xticks(range(30, 81, 10))
-    axes[0].set(yscale="log", ylim=(0.05, 60.0))
-    axes[0].set_yticks([0.1, 1.0, 10.0], ["0.1", "1", "10"])
+    axes[0].set_yscale("log")
+    axes[0].set_yticks([0.1, 1.0, 10.0, 100.0], ["0.1", "1", "10", "100"])
+    axes[0].set_ylim(0.05, max(60.0, 1.3 * runs.rmse_m.max()))
     axes[1].set_ylim(0, 103)
     axes[2].set_ylim(bottom=0)
     for ax, corner in zip(axes, ("upper right", "lower right", "upper right"), strict=True):
