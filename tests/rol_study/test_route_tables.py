@@ -202,6 +202,15 @@ def test_a_kept_table_is_no_more_and_no_less_than_the_jobs() -> None:
     assert set(ingredients.index) == set(route_tables.INGREDIENTS) and (ingredients >= 3).all()
 
 
+def test_the_kept_runs_at_other_places_are_whole_sessions() -> None:
+    table = route_tables.load_table(Path(__file__).resolve().parents[2] / "data" / "ablations", "places")
+    assert (table.groupby("job").size() == 3).all()  # paper, and robust with both calibrations
+    found = {(place, quality) for place, quality in zip(table.place, table.fraction_1m, strict=True)}
+    listed = route_tables.PLACE_QUALITIES.items()
+    assert found == {(place, quality) for place, pairs in listed for quality, _ in pairs}
+    assert set(table.session) == {"02", "03"} and table.n_scans.min() > 3000
+
+
 def test_a_table_is_completed_and_nothing_is_measured_twice(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
