@@ -37,6 +37,7 @@ from rol_study.oxford_route import (
 )
 from rol_study.sampled_points import (
     FrontEnd,
+    SampledPointsError,
     VisiblePoints,
     find_visible_points,
     measure_fractions,
@@ -138,6 +139,38 @@ def prepare_experiment(
     visible = find_visible_points(map_points, session.truth)
     own = session, map_points, front_end, visible, mixture_poses, _choose(poses, N_REFERENCE)
     return change_front_end(RouteExperiment(*own, np.ones(3) / 3, motion, other, 0.0, grid), front_end)
+
+
+def prepare_sessions(
+    real_root: Path | str, numbers: Iterable[str], front_end: FrontEnd, **options: object
+) -> tuple[dict[str, RouteExperiment], dict[str, str]]:
+    """Prepare the experiments of several sessions.
+
+    Parameters
+    ----------
+    real_root : path
+        Folder of the real data.
+    numbers : iterable of str
+        Sessions, such as "02".
+    front_end : FrontEnd
+        Properties of the sampled points.
+    **options
+        See `prepare_experiment`.
+
+    Returns
+    -------
+    experiments : dict of str to RouteExperiment
+        By session.
+    left_out : dict of str to str
+        Sessions from whose map points of this quality cannot be sampled, with the reason.
+    """
+    experiments, left_out = {}, {}
+    for number in numbers:
+        try:
+            experiments[number] = prepare_experiment(real_root, number, front_end, **options)
+        except SampledPointsError as fault:
+            left_out[number] = str(fault)
+    return experiments, left_out
 
 
 def _choose(poses: np.ndarray, n: int) -> np.ndarray:

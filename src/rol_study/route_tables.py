@@ -26,7 +26,7 @@ from rol_beyond.motion import MotionModel
 from rol_beyond.recovery import DetectionSettings, RecoverySettings
 from rol_beyond.robust import settings_for
 from rol_data.rall import PLACES, POSES_PATH, load_poses
-from rol_study.oxford_route import list_sessions
+from rol_study.oxford_route import list_sessions, published_motion, published_reference_contrast
 from rol_study.rendered_points import build_segment, render_points
 from rol_study.route_experiments import (
     FilterRun,
@@ -47,6 +47,8 @@ SHORT = 3000  # scans of the runs that compare settings
 # Fractions within 1 m; 0.40 is the table "seeds". A lost filter takes minutes, so the poorest come last.
 QUALITIES = (0.44, 0.47, 0.50, 0.60, 0.80, 0.35, 0.30)
 COMPARED = (0.40, 0.47)  # qualities at which settings and causes are compared
+# Fractions within 1 m and 2 m at other places: KAIST's map is too dense for 47 %.
+PLACE_QUALITIES = {"kaist": ((0.65, 0.78),), "dcc": ((0.47, 0.65), (0.65, 0.78))}
 DEG = float(np.deg2rad(1.0))
 SETTINGS = {
     "particles": [("n_particles", n) for n in (50, 100, 500, 2000)],
@@ -72,7 +74,8 @@ CAUSES = {
 }
 COMPARED_ODOMETRIES = ("true", "cfear")
 CLASSES = ("within_1m_2deg", "within_2m_5deg", "within_5m_10deg")
-TEXT = dict.fromkeys(("job", "session", "odometry"), str)  # pandas reads "true" as a truth value
+# Read as text: pandas reads "true" as a truth value and "01" as a number.
+TEXT = dict.fromkeys(("job", "session", "odometry"), str)
 RUN_COLUMNS = ["fraction_1m", "odometry", *METRICS]
 INGREDIENTS = {
     "all of robust": {},
@@ -189,6 +192,28 @@ def measure_odometry(real_root: str, number: str, odometry: str, fraction_1m: fl
     ]
 
 
+def measure_places(
+    real_root: str, number: str, place: str, fraction_1m: float, fraction_2m: float, seed: int
+) -> list[dict]:
+    """Run both methods over a whole session of another place, with all settings as on Oxford.
+
+    The method `robust` is run twice: with motion model and reference contrast of another session of the same
+    place, and with those of Oxford's session 01.
+    """
+    own = prepare_experiment(real_root, number, FrontEnd(fraction_1m, fraction_2m), place=place)
+    reference = published_reference_contrast(fraction_1m)
+    oxford = replace(own, motion=published_motion(), reference_contrast=reference)
+    clouds, rows = sample_session(own, seed), []
+    for method, experiment, calibrated_on in (
+        ("paper", own, "none"),
+        ("robust", own, f"{place} {own.calibration_session}"),
+        ("robust", oxford, "oxford 01"),
+    ):
+        about = {"place": place, "fraction_1m": fraction_1m, "calibrated_on": calibrated_on}
+        rows.append(about | row_of(experiment, run_method(experiment, method, clouds, seed), method, seed))
+    return rows
+
+
 def measure_causes(real_root: str, number: str, fraction_1m: float, seed: int) -> list[dict]:
     """Run the method `paper` with one possible cause of larger errors after the other."""
     rows = []
@@ -292,6 +317,7 @@ MEASURES = {
     "causes": measure_causes,
     "settings": measure_settings,
     "odometry": measure_odometry,
+    "places": measure_places,
     "ingredients": measure_ingredients,
     "tuned": measure_tuned,
     "registration": measure_registration,
@@ -326,6 +352,7 @@ def list_jobs(real_root: str) -> dict[str, list[tuple]]:
         "causes": [(n, q, seed) for n in last_first[:2] for q in COMPARED for seed in (1, 2, 3)],
         "settings": [(first, quality, seed) for quality in COMPARED for seed in (1, 2, 3)],
         "odometry": list_odometry(last_first[:2]),
+        "places": list_places(real_root),
         "outliers": [(first, share, seed) for share in (0.015, 0.05) for seed in (1, 2, 3)],
         "anywhere": places(50, 120),
         "ingredients": [(starts[-1], name, seed) for name in INGREDIENTS for seed in (1, 2, 3, 4, 5)],
@@ -350,6 +377,18 @@ def list_odometry(numbers: list[str]) -> list[tuple]:
         if number == "02" or name == "true"
     ]
     return [(*key, quality, seed) for quality in (0.40, 0.50) for seed in (1, 2, 3) for key in wanted]
+
+
+def list_places(real_root: str) -> list[tuple]:
+    """List the jobs of other places: all sessions but the one that a place's map was made from."""
+    return [
+        (number, place, *quality, seed)
+        for seed in (1, 2, 3)
+        for place, qualities in PLACE_QUALITIES.items()
+        for number in list_sessions(real_root, place)
+        if number != PLACES[place].mapping_session
+        for quality in qualities
+    ]
 
 
 def load_truth(real_root: str, number: str) -> np.ndarray:

@@ -16,6 +16,7 @@ from rol_beyond.recovery import DetectionSettings, RecoverySettings
 from rol_beyond.robust import settings_for
 from rol_beyond.scan_matching import ScanToMapSettings
 from rol_data import cfear, rall
+from rol_study import route_experiments
 from rol_study.oxford_route import (
     ODOMETRIES,
     RouteError,
@@ -43,7 +44,7 @@ from rol_study.route_experiments import (
     sample_session,
     skew_by_motion,
 )
-from rol_study.sampled_points import FrontEnd
+from rol_study.sampled_points import FrontEnd, SampledPointsError
 
 MAP = np.array([[0.0, 0.0], [100.0, 100.0]])
 MAP_ALL = np.array([[-2000.0, -2000.0], [2000.0, 2000.0]])  # holds any route
@@ -250,6 +251,17 @@ def test_another_front_end_is_the_same_as_prepared_with_it(real_root: Path) -> N
     assert changed.front_end == better and len(changed.session.truth) == 3
     np.testing.assert_array_equal(changed.parts, prepared.parts)
     assert changed.reference_contrast == prepared.reference_contrast
+
+
+def test_sessions_whose_points_cannot_be_sampled_are_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    def prepare(real_root, number, front_end, *, place):
+        if number == "02":
+            raise SampledPointsError("the map is too dense")
+        return real_root, number, front_end, place
+
+    monkeypatch.setattr(route_experiments, "prepare_experiment", prepare)
+    experiments, left_out = route_experiments.prepare_sessions("", ["01", "02"], FrontEnd(), place="dcc")
+    assert experiments == {"01": ("", "01", FrontEnd(), "dcc")} and left_out == {"02": "the map is too dense"}
 
 
 @pytest.fixture(scope="module")

@@ -122,6 +122,35 @@ def test_better_points_and_another_odometry_are_run_with_both_methods(asked: lis
     assert [made.experiment.session.odometry for made in asked] == ["rall"] * 2 + ["true"] * 2
 
 
+def test_other_places_are_run_with_both_calibrations(asked: list, monkeypatch: pytest.MonkeyPatch) -> None:
+    def prepare(real_root, number, front_end, *, place):
+        experiment = route_tables.experiment_of(real_root, number, front_end)
+        session = replace(experiment.session, place=place)
+        return replace(experiment, session=session, motion=MotionModel(), reference_contrast=0.2)
+
+    monkeypatch.setattr(route_tables, "prepare_experiment", prepare)
+    rows = route_tables.measure_places("", "02", "dcc", 0.65, 0.78, 2)
+    assert [(row["method"], row["calibrated_on"]) for row in rows] == [
+        ("paper", "none"), ("robust", "dcc 01"), ("robust", "oxford 01")
+    ]  # fmt: skip
+    assert {(row["place"], row["fraction_1m"]) for row in rows} == {("dcc", 0.65)}
+    _, own, oxford = (made.experiment for made in asked)
+    assert (own.motion, own.reference_contrast) == (MotionModel(), 0.2)
+    assert oxford.motion == published_motion() and oxford.reference_contrast == 0.172
+    assert {made.experiment.front_end.fraction_2m for made in asked} == {0.78}
+    assert all(made.changes == {} and made.recovery is None for made in asked)  # settings untouched
+
+
+def test_other_places_are_judged_without_the_session_of_their_map(tmp_path: Path) -> None:
+    assert route_tables.list_places(str(tmp_path)) == []
+    for number in ("01", "02"):
+        for path in (rall.PLACES["dcc"].poses, rall.PLACES["dcc"].odometry):
+            (tmp_path / path.format(number)).parent.mkdir(parents=True, exist_ok=True)
+            (tmp_path / path.format(number)).touch()
+    jobs = route_tables.list_places(str(tmp_path))
+    assert {job[:2] for job in jobs} == {("02", "dcc")} and {job[-1] for job in jobs} == {1, 2, 3}
+
+
 def test_a_row_is_also_judged_without_scans_of_faulty_ground_truth(asked: list) -> None:
     route_tables.measure_registration("", "07", 1)
     experiment, run = asked[0].experiment, route_tables.run_method(asked[0].experiment, "paper", [], 1)
@@ -171,6 +200,15 @@ def test_a_kept_table_is_no_more_and_no_less_than_the_jobs() -> None:
         assert not table.job.duplicated().any() and table[key].notna().all()
     ingredients = table.groupby("without").seed.nunique()
     assert set(ingredients.index) == set(route_tables.INGREDIENTS) and (ingredients >= 3).all()
+
+
+def test_the_kept_runs_at_other_places_are_whole_sessions() -> None:
+    table = route_tables.load_table(Path(__file__).resolve().parents[2] / "data" / "ablations", "places")
+    assert (table.groupby("job").size() == 3).all()  # paper, and robust with both calibrations
+    found = {(place, quality) for place, quality in zip(table.place, table.fraction_1m, strict=True)}
+    listed = route_tables.PLACE_QUALITIES.items()
+    assert found == {(place, quality) for place, pairs in listed for quality, _ in pairs}
+    assert set(table.session) == {"02", "03"} and table.n_scans.min() > 3000
 
 
 def test_a_table_is_completed_and_nothing_is_measured_twice(
