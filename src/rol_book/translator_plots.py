@@ -179,7 +179,7 @@ def draw_front_ends(points: pd.DataFrame, names: Mapping[str, str], half: float 
     """
     n_columns = len(names) if len(names) < 4 else 2
     n_rows = -(-len(names) // n_columns)
-    figure, axes = plots.subplots(n_rows, n_columns, height=n_rows * 9.6 / n_columns, squeeze=False)
+    figure, axes = plots.subplots(n_rows, n_columns, height=n_rows * 8.4 / n_columns, squeeze=False)
     clouds = {name: table for name, table in points.groupby("front_end")}
     for ax, (name, title) in zip(axes.flat, names.items(), strict=False):
         cloud, near = clouds[name], clouds[name].distance_m < 1.0
@@ -220,7 +220,12 @@ def draw_changes(compared: pd.DataFrame, noise: Mapping[str, float], labels: Map
         for place in places[change.isna().to_numpy()]:
             ax.text(0.03, place, "not reached", va="center", transform=ax.get_yaxis_transform())
         ax.set_yticks(places, labels.values())
-        ax.set(title=title, xlabel="change of the precision [points]", xlim=(-6.5, 4.5))
+        ax.set(
+            title=title,
+            xlabel="change of the precision [points]",
+            xlim=(-6.5, 4.5),
+            ylim=(0.6 - len(labels), 0.6),
+        )
     return figure
 
 
@@ -248,7 +253,7 @@ def draw_curves(
         for name, (label, colour) in looks.items():
             _draw_curve(ax, curves[name], label, colour)
         ax.set(title=title, xlabel="recall at 1 m [%]", ylabel="precision at 1 m [%]")
-        ax.set(xlim=(0, 100), ylim=(70, 100))
+        ax.set(xlim=(0, 100), ylim=(75, 100))
         ax.legend(loc="lower left")
     return figure
 
@@ -294,6 +299,6 @@ def draw_tuning(tuned: pd.DataFrame) -> Figure:
                 ax.plot(line["steps"], line[column], color=colour, linewidth=0.8, alpha=0.6)
             means = own.groupby("steps")[column].mean()
             ax.plot(means.index, means, marker=marker, color=colour, label=label)
-        ax.set(title=title, xlabel="steps", ylabel="points within 1 m [%]")
-    axes[0].legend(loc="best")
+        ax.set(title=title, xlabel="steps", ylabel="points within 1 m [%]", ylim=(0, 102))
+    axes[0].legend(loc="lower left")
     return figure
