@@ -65,6 +65,7 @@ def draw_cases(cases: Sequence[Mapping[str, Any]], edges: np.ndarray) -> Figure:
     """
     titles = ("radar", "generated", "lidar")
     figure, axes = plots.subplots(len(cases), 4, height=2.3 * len(cases), squeeze=False)
+    top = max(105.0 * case["counts"].max() / max(case["counts"].sum(), 1) for case in cases)
     for i, (row, case) in enumerate(zip(axes, cases, strict=True)):
         radar = np.maximum(case["radar"], NOISE_POWER) - NOISE_POWER
         images = [radar, case["generated"], case["lidar"]]
@@ -74,7 +75,7 @@ def draw_cases(cases: Sequence[Mapping[str, Any]], edges: np.ndarray) -> Figure:
         )
         text = f"{case['within_1m']:.0f} % < 1 m\n{case['within_2m']:.0f} % < 2 m"
         plots.draw_distances(row[3], case["counts"], edges, text=text)
-        row[3].set(xlabel="distance [m]" if i == len(cases) - 1 else "", ylabel="points [%]")
+        row[3].set(xlabel="distance [m]" if i == len(cases) - 1 else "", ylim=(0.0, max(top, 1.0)))
         row[3].set_title("NN distance" if i == 0 else "")
     return figure
 
