@@ -112,6 +112,7 @@ ALIGNMENT = OUT + "/alignment/{session}/alignment.csv"
 PAIRS, CORRECTED = (OUT + "/" + folder + "/{session}/pairs.json" for folder in ("pairs", "pairs-corrected"))
 GENERATED = OUT + "/fake/{session}/fake.json"
 NETWORK, SUMMARY, MAPS = f"{OUT}/pix2pix/generator.safetensors", f"{OUT}/maps/summary.json", OUT + "/maps/{session}.npz"
+FRONT_ENDS = f"{OUT}/similarity/front_ends.csv"
 TRUTH, METRICS = OUT + "/ground_truth/{session}.tum", OUT + "/localization/{session}/{method}/metrics.json"
 ALL_MADE = [session_made(session) for session in SESSIONS]
 
@@ -140,7 +141,7 @@ STEPS = {
             "weights": NETWORK,
             "shipped": SHIPPED,
         },
-        {"similarity": expand(OUT + "/similarity/{session}.json", session=SESSIONS)},
+        {"similarity": expand(OUT + "/similarity/{session}.json", session=SESSIONS), "front_ends": FRONT_ENDS},
     ),
     "ground_truth": (
         "06_ground_truth",
@@ -181,7 +182,11 @@ STEPS = {
     "ablations": (
         "13_ablations",
         "ablations",
-        {"tables": found("data/ablations/*.csv"), "cards": [str(Path(path).with_suffix(".json")) for path in SHIPPED]},
+        {
+            "tables": found("data/ablations/*.csv"),
+            "cards": [str(Path(path).with_suffix(".json")) for path in SHIPPED],
+            "front_ends": FRONT_ENDS,
+        },
         {},
     ),
     "runtime": ("14_runtime", "runtime", {"measured": found("data/performance/*.json")}, {}),
@@ -204,7 +209,7 @@ BEFORE = {  # commands that come before papermill
         for folder in ("pairs", "pairs-corrected")
     )
 }
-# All others have 0. Those with -1 need no other chapter and fill gaps.
+# All others have 0. Those with -1 are needed by no other chapter and fill gaps.
 PRIORITIES = {"real_vs_fake": 1} | dict.fromkeys(
     ("real_pairs", "oxford_route", "robust_filter", "ablations", "runtime"), -1
 )

@@ -8,7 +8,8 @@ own previous output, so that it forgets nothing there.
 from __future__ import annotations
 
 import copy
-from collections.abc import Sequence
+from collections import deque
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -31,12 +32,15 @@ class RealPair:
     power, azimuths : array, shape (a, b) and (a,)
         Power in half-dB steps, and counter-clockwise bearings of the rows [rad].
     points : array, shape (n, 2)
-        Lidar points without the ground, in the radar frame [m].
+        Lidar points without the ground, in the radar frame [m]; at mid-scan if there is a twist.
+    twist : tuple of float, optional
+        Body velocity for the motion compensation of the scan [m/s, m/s, rad/s]; without it there is none.
     """
 
     power: np.ndarray
     azimuths: np.ndarray
     points: np.ndarray
+    twist: tuple[float, float, float] | None = None
 
 
 @dataclass(frozen=True)
@@ -72,15 +76,16 @@ def draw_real_pair(
     config : AdaptationConfig
         Reach of the lidar, threshold, precision.
     settings : PairSettings
-        Settings of the images; motion is not compensated.
+        Settings of the images; motion is compensated if the pair has a twist.
 
     Returns
     -------
     radar, target : array, shape (w, w), uint8
         The target is the lidar's image within the reach, and the network's output beyond it.
     """
-    still = replace(settings, motion="none")
-    radar = rotated_radar_image(pair.power, pair.azimuths, turn, (0.0, 0.0, 0.0), still)
+    settings = replace(settings, motion="none" if pair.twist is None else "corrected")
+    twist = pair.twist or (0.0, 0.0, 0.0)
+    radar = rotated_radar_image(pair.power, pair.azimuths, turn, twist, settings)
     size, width = settings.pixel_size, len(radar)
     seen = points_to_image(rotate_points(pair.points, turn), width=width, pixel_size=size)
     axis = ((width - 1) / 2.0 - np.arange(width)) * size
@@ -122,6 +127,18 @@ def adapt(
     ValueError
         If there are no pairs, or a loss is not finite.
     """
+    return deque(adapt_steps(generator, pairs, rng, config, settings), maxlen=1)[0]
+
+
+def adapt_steps(
+    generator: Generator,
+    pairs: Sequence[RealPair],
+    rng: np.random.Generator,
+    config: AdaptationConfig,
+    settings: PairSettings | None = None,
+) -> Iterator[Generator]:
+    """Fine-tune as `adapt` does, and yield the copy after every step;
+    it is the same object each time."""
     if len(pairs) == 0:
         raise ValueError("no real pairs to adapt to")
     before, adapted = generator.eval(), copy.deepcopy(generator).eval().requires_grad_(True)
@@ -143,4 +160,5 @@ def adapt(
         optimizer.zero_grad(set_to_none=True)
         loss.backward()
         optimizer.step()
-    return adapted.requires_grad_(False)
+        yield adapted
+    adapted.requires_grad_(False)
