@@ -209,9 +209,11 @@ BEFORE = {  # commands that come before papermill
         for folder in ("pairs", "pairs-corrected")
     )
 }
-# All others have 0. Those with -1 are needed by no other chapter and fill gaps.
-PRIORITIES = {"real_vs_fake": 1} | dict.fromkeys(
-    ("real_pairs", "oxford_route", "robust_filter", "ablations", "runtime"), -1
+# Chapter 05 takes longest and needs all sessions, so these come first. All others have 0; those with -1 are needed by no
+# other chapter and fill gaps.
+FIRST, NEXT = 3, 2
+PRIORITIES = {"alignment": FIRST, "ground_removal": FIRST, "real_vs_fake": NEXT} | dict.fromkeys(
+    ("real_pairs", "oxford_route", "robust_filter", "ablations", "runtime", "simulator"), -1
 )
 
 
@@ -252,6 +254,7 @@ rule simulated_session:
         recipe=lambda wildcards: json.dumps(recipe(wildcards.session), sort_keys=True),
         code=chapters.module_digest(f"{chapters.SIMULATOR}.__main__"),
         made=SESSIONS_ROOT + "/{session}",
+    priority: FIRST
     message:
         "simulated session {wildcards.session}"
     shell:  # the writer goes on with what is there, which is right after a stop and wrong after a change of its code
@@ -322,7 +325,7 @@ rule generated_images:
         out=OUT + "/fake/{session}",
         options=TRANSLATION["options"],
         code=chapters.script_digest("generate_images.py"),
-    priority: 1
+    priority: NEXT
     message:
         "generated images, {wildcards.session}"
     shell:

@@ -21,7 +21,7 @@ import yaml
 
 import chapters
 import check
-from chapters import NOTEBOOKS, ROOT, ChapterError, tagged_cells
+from chapters import NOTEBOOKS, ROOT, ChapterError
 from rol.files import read_text, write_text
 from toolbox_pages import stage_toolbox
 
@@ -44,22 +44,24 @@ def figure_of(cell: nbformat.NotebookNode) -> dict:
 
 
 def name_folded_cells(notebook: nbformat.NotebookNode) -> None:
-    """Hide the parameters, and label each hidden cell by what it holds: parameters, setup, or plot code (in place)."""
-    for tag in ("parameters", "injected-parameters"):
-        for cell in tagged_cells(notebook, tag):
-            cell.metadata["tags"] = [tag, "hide-input"]
+    """Hide the parameters, and label each hidden cell by what it holds (in place)."""
+    names = {
+        "parameters": "parameters",
+        "injected-parameters": "parameters of this run",
+        "hide-input": "plot code",
+        "hide-cell": "setup",
+    }
     for cell in notebook.cells:
-        tags = set(cell.metadata.get("tags", []))
-        names = {
-            "parameters": "parameters",
-            "injected-parameters": "parameters of this run",
-            "hide-input": "plot code",
-            "hide-cell": "setup",
-        }
-        words = next((words for tag, words in names.items() if tag in tags), "")
-        if words:
-            prompts = {f"code_prompt_{do}": f"{do.title()} {words}" for do in ("show", "hide")}
-            cell.metadata["mystnb"] = cell.metadata.get("mystnb", {}) | prompts
+        tags = cell.metadata.get("tags", [])
+        tag = next((tag for tag in names if tag in tags), None)
+        if tag is None:
+            continue
+        if tag.endswith("parameters"):
+            cell.metadata["tags"] = [tag, "hide-input"]
+        prompts = {f"code_prompt_{do}": f"{do.title()} {names[tag]}" for do in ("show", "hide")}
+        cell.metadata["mystnb"] = cell.metadata.get("mystnb", {}) | prompts
+        if tag == "hide-cell":
+            names[tag] = "computation"  # of all but the first
 
 
 def complete_captions(notebook: nbformat.NotebookNode, kind: str) -> None:

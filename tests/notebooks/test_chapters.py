@@ -35,9 +35,11 @@ def test_shown_code_fits_the_page(notebook: nbformat.NotebookNode) -> None:
     assert not wide
 
 
-def test_setup_is_one_hidden_cell(notebook: nbformat.NotebookNode) -> None:
-    setup = [cell for cell in notebook.cells if "hide-cell" in cell.metadata.get("tags", [])]
-    assert len(setup) == 1
+def test_setup_comes_first(notebook: nbformat.NotebookNode) -> None:
+    """The cell below the parameters is hidden and holds the imports; no other cell imports a package of the project."""
+    parameters, setup, *others = own_code(notebook)
+    assert "parameters" in parameters.metadata["tags"] and "hide-cell" in setup.metadata["tags"]
+    assert not any(re.search(r"^(from|import) rol", cell.source, re.MULTILINE) for cell in others)
 
 
 def test_numbers_are_stored_in_one_way(notebook: nbformat.NotebookNode) -> None:

@@ -312,12 +312,13 @@ def test_book_without_a_first_picture_is_refused(book: Path, monkeypatch: pytest
 
 
 def test_hidden_cells_say_what_they_hold() -> None:
-    tags = (["parameters"], ["injected-parameters"], ["hide-cell"], ["hide-input"], [])
+    tags = (["parameters"], ["injected-parameters"], ["hide-cell"], ["hide-input"], ["hide-cell"], [])
     cells = [nbformat.v4.new_code_cell("a = 1", metadata={"tags": tag}) for tag in tags]
     cells[3].metadata["mystnb"] = {"image": {"alt": "words"}}
     stage_book.name_folded_cells(nbformat.v4.new_notebook(cells=cells))
     shown = [cell.metadata.get("mystnb", {}).get("code_prompt_show") for cell in cells]
-    assert shown == ["Show parameters", "Show parameters of this run", "Show setup", "Show plot code", None]
+    words = ["parameters", "parameters of this run", "setup", "plot code", "computation"]
+    assert shown == [*(f"Show {word}" for word in words), None]
     assert all("hide-input" in cell.metadata["tags"] for cell in cells[:2])
     assert cells[3].metadata["mystnb"]["image"] == {"alt": "words"}
 
