@@ -110,5 +110,7 @@ def draw_drift(axes: Sequence[Axes], ways: pd.DataFrame, colours: Mapping[str, s
     drift.minorticks_off()
     drift.figure.legend(*drift.get_legend_handles_labels(), loc="outside upper center", ncols=2)
     time.set(xlabel="time per scan [ms]")
-    time.tick_params(labelleft=False)
+    time.set_yticks(places, [""] * len(places))
+    for ax in axes:
+        ax.set_ylim(-0.6, len(places) - 0.4)
     return axes
