@@ -250,7 +250,7 @@ def draw_error_cdfs(
             )
     for ax, limits in zip(axes, np.transpose(CLASSES), strict=True):
         for number, values in enumerate(published.values()):
-            label = "" if number else "published (Table III)"
+            label = "" if number else "paper's Table III"
             ax.plot(limits, values, "o", color="#000000", markerfacecolor="white", label=label, zorder=4)
         ax.set(xscale="log", xlim=(min_m, 20.0), ylim=(0, 103), ylabel="scans below the error [%]")
         ax.xaxis.set_major_formatter("{x:g}")

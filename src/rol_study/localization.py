@@ -36,9 +36,9 @@ POINT_SOURCES = {  # name -> label; "corrected": at mid-scan
     "raw": "raw radar peaks",
     "fake": "generated points",
     "real": "lidar points",
-    "raw-corrected": "raw radar peaks, motion-compensated",
-    "fake-corrected": "generated points, motion-compensated",
-    "real-corrected": "lidar points, motion-compensated",
+    "raw-corrected": "raw radar peaks, compensated",
+    "fake-corrected": "generated points, compensated",
+    "real-corrected": "lidar points, compensated",
 }
 FAST_MPS = 4.0  # speed above which `heading_bias_deg` counts a scan [m/s]
 DIAGNOSTICS = {  # column of steps.csv -> field of MclUpdate
