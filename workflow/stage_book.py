@@ -25,7 +25,7 @@ from chapters import NOTEBOOKS, ROOT, ChapterError
 from rol.files import read_text, write_text
 from toolbox_pages import stage_toolbox
 
-FIGURE_DATA = ("session", "real", "simulated", "both")  # what a figure shows
+FIGURE_DATA = ("session", "real", "simulated", "both", "none")  # what a figure shows; none: no data
 MADE_TITLE, STAGING = "# How this book was made", "# This book is being staged"  # first line of made.md
 GLUED_KIND = "{glue:text}`kind`"
 # The picture of the first page is taken from a run: the first of these that there is, and what the page says of it.

@@ -9,6 +9,7 @@ import nbformat
 import pytest
 
 from chapters import CHAPTERS, NOTEBOOKS, own_code
+from stage_book import FIGURE_DATA
 
 MOST_WORDS, MOST_LINES, WIDEST = 1600, 350, 80
 HIDDEN = {"parameters", "hide-cell", "hide-input"}
@@ -51,5 +52,5 @@ def test_figures_and_tables_are_numbered_and_say_what_they_show(notebook: nbform
         figure = cell.metadata.get("mystnb", {}).get("figure", {})
         if figure:
             assert re.match(r"(fig|tab)-[a-z0-9-]+$", figure["name"])
-            assert cell.metadata["data"] in ("session", "real", "simulated", "both")
+            assert cell.metadata["data"] in FIGURE_DATA
             assert len(figure["caption"].split()) >= 6
