@@ -10,10 +10,8 @@ from collections.abc import Mapping, Sequence
 import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.collections import LineCollection
 
-from rol.geometry import exp, transform_points
-from rol.radar import azimuth_times
+from rol.geometry import transform_points
 from rol_book import plots
 from rol_book.plots import COLOURS
 
@@ -62,42 +60,6 @@ def draw_timeline(
     ax.set(xlabel="time since the scan's stamp [ms]", ylim=(len(names) + 1.6, -0.6), xlim=(-75, end + 15))
     ax.grid(False, axis="y")
     ax.legend(loc="lower center", ncols=2, fontsize=9.5, columnspacing=1.2)
-    return ax
-
-
-def draw_beams(ax: Axes, twist: np.ndarray, *, length: float = 4.0, every: int = 8) -> Axes:
-    """Draw the beams of one radar scan from where the moving radar sent them, coloured by time.
-
-    Parameters
-    ----------
-    ax : Axes
-        Where to draw.
-    twist : array, shape (3,)
-        Velocity of the radar [m/s, m/s, rad/s].
-    length : float
-        Length of the beams [m].
-    every : int
-        One beam is drawn out of so many rows.
-
-    Returns
-    -------
-    ax : Axes
-        The axes.
-    """
-    seconds = azimuth_times(400)
-    poses = exp(np.asarray(twist, dtype=float), seconds)  # in the frame at mid-scan
-    bearings = poses[:, 2] - 2.0 * np.pi * np.arange(400) / 400  # the antenna turns clockwise
-    tips = poses[:, :2] + length * np.stack([np.cos(bearings), np.sin(bearings)], axis=1)
-    beams = np.stack([poses[:, :2], tips], axis=1)[:, :, ::-1]  # y to the left, x up
-    shade = TIME_COLOURS(np.linspace(0, 1, 400))
-    ax.add_collection(LineCollection(beams[::every], colors=shade[::every], linewidths=0.8, alpha=0.7))
-    edge = np.stack([tips[:-1], tips[1:]], axis=1)[:, :, ::-1]
-    ax.add_collection(LineCollection(edge, colors=shade, linewidths=3.0))
-    plots.draw_track(ax, poses, colour=COLOURS["truth"])
-    ax.plot(*poses[[0, -1], 1::-1].T, "o", color=COLOURS["truth"], markersize=4)
-    half = length + 0.5 * np.hypot(*(poses[-1] - poses[0])[:2]) + 0.4
-    ax.set(xlim=(half, -half), ylim=(-half, half))
-    ax.grid(False)
     return ax
 
 

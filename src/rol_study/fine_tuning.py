@@ -27,8 +27,9 @@ from rol_beyond.front_ends import MAX_RANGE_M, MIN_RANGE_M, generate_points
 from rol_data.oxford_pairs import find_pairs
 from rol_data.radiate import load_pairs, radiate_azimuths
 from rol_data.rall import MAP_PATH, RealScan, load_map_points, load_posed_scans
+from rol_study.real_localization import crop_map
 from rol_study.real_pairs import load_scan_pairs
-from rol_study.real_scans import FOG, crop_map, lidar_points
+from rol_study.real_scans import FOG, lidar_points
 
 FOG_RANGE_M = 20.0  # range up to which the lidar sees through the fog, as in chapter 10 [m]
 MARGIN_M = 10.0  # reference points are used so much beyond the range of the comparison [m]

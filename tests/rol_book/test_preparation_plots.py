@@ -7,7 +7,6 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
-from matplotlib.collections import LineCollection
 
 from rol_book import preparation_plots as draw
 
@@ -21,19 +20,6 @@ def close_figures():
 def offsets(ax):
     """Points of each scatter of a panel, as (y, x) on paper."""
     return [np.asarray(part.get_offsets()) for part in ax.collections]
-
-
-def test_beams_of_a_stationary_radar_close_and_those_of_a_moving_one_do_not():
-    for speed, gap_m in ((0.0, 0.0), (10.0, 2.5)):
-        ax = draw.draw_beams(plt.subplots()[1], np.array([speed, 0.0, 0.0]), every=1)
-        beams, edge = (part for part in ax.collections if isinstance(part, LineCollection))
-        segments = np.array(edge.get_segments())
-        ends = segments[0, 0], segments[-1, 1]
-        assert np.hypot(*np.subtract(*ends)) == pytest.approx(gap_m, abs=0.08)  # less one row of 400
-        lengths = np.hypot(*np.diff(np.array(beams.get_segments()), axis=1)[:, 0].T)
-        np.testing.assert_allclose(lengths, 4.0)
-    quarter = np.array(beams.get_segments())[100]  # a quarter of a turn later the antenna looks to the right
-    assert quarter[1, 0] - quarter[0, 0] == pytest.approx(-4.0)
 
 
 def test_timeline_has_a_bar_for_each_sweep():
