@@ -151,12 +151,10 @@ async (known) => {
   }
 
   // ---- links --------------------------------------------------------------------------------------------------
-  const large = all("article img, article canvas").filter((e) => shown(e) && e.getBoundingClientRect().height >= 100);
   const links = all("a[href]").map((e) => [e.href, e.getAttribute("href")]);
   const anchors = ids.concat(all("a[name]").map((e) => e.name));
   return {
     faults, links, anchors, theme: document.documentElement.dataset.theme || "light", kinds: [...samples.keys()],
-    picture: large.length ? Math.round(large[0].getBoundingClientRect().bottom + window.scrollY) : null,
     counts: { equations: equations.length, images: images.length, canvases: all("article canvas").length },
   };
 }

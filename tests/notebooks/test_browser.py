@@ -18,7 +18,6 @@ import pytest
 from axe_playwright_python.sync_playwright import Axe
 from playwright.sync_api import Browser, ConsoleMessage, Error, Request, sync_playwright
 
-from chapters import CHAPTERS
 from print_book import OFFLINE, find_chromium
 
 LOCAL = ("file:", "data:", "blob:", "about:")
@@ -40,13 +39,6 @@ RULES = {
     "contrast": "text stands out from its ground, 4.5 to 1, large text 3 to 1",
 }
 BROWSERS = 2  # for the pages of a book, each in its own thread
-FIRST_SCREEN_PX = 800  # height of the window of a small laptop
-NEED_REAL_DATA = (
-    "09_real_pairs",
-    "10_real_radar",
-    "11_oxford_route",
-    "12_robust_filter",
-)  # without it no picture
 
 
 @dataclass(frozen=True)
@@ -66,8 +58,7 @@ class Visit:
     """A page in one view: its address, the view, faults as (rule, what), and what the page holds.
 
     ``links`` are pairs of the whole address and the attribute, ``anchors`` the names that can be linked to, ``counts``
-    the numbers of equations, images and canvases; ``theme`` is "light" or "dark"; ``picture`` is the lower edge of the
-    first picture [px].
+    the numbers of equations, images and canvases; ``theme`` is "light" or "dark".
     """
 
     address: str
@@ -77,7 +68,6 @@ class Visit:
     anchors: list[str]
     theme: str
     counts: dict[str, int]
-    picture: int | None
 
 
 class Tab:
@@ -248,19 +238,6 @@ def test_every_page_was_seen_with_what_it_holds(html: Path, visits: list[Visit])
         assert sum(visit.counts[kind] for visit in visits) > 0, f"no {kind} in the whole book"
 
 
-def test_chapters_have_a_picture_on_the_first_screen(visits: list[Visit]) -> None:
-    chapters = [
-        v for v in visits if "/notebooks/" in v.address and (v.picture is not None or not needs_real(v))
-    ]
-    assert len(chapters) >= 2 * (len(CHAPTERS) - len(NEED_REAL_DATA))
-    late = [f"{told(v)}: ends at {v.picture} px" for v in chapters if (v.picture or 1e9) > FIRST_SCREEN_PX]
-    assert not late, "\n".join(late)
-
-
-def needs_real(visit: Visit) -> bool:
-    return any(chapter in visit.address for chapter in NEED_REAL_DATA)
-
-
 def test_every_link_leads_somewhere(visits: list[Visit]) -> None:
     assert sum(len(visit.links) for visit in visits) > len(visits)
     assert not broken_links(visits)
@@ -392,14 +369,6 @@ def test_good_page_has_no_fault(tmp_path: Path, tab: Tab, article: str) -> None:
 def test_rule_bites(tmp_path: Path, tab: Tab, rule: str, article: str, words: str) -> None:
     faults = tab.visit(small_page(tmp_path, article), [NARROW])[0].faults
     assert any(name == rule and words in what for name, what in faults), faults
-
-
-@pytest.mark.parametrize(("before", "ends"), [("", 0), ("<div style='height: 2000px'>words</div>", 2000)])
-def test_place_of_the_first_picture_is_told(tmp_path: Path, tab: Tab, before: str, ends: int) -> None:
-    picture = "<img src='dot.png' alt='A dot' style='display: block; height: 300px'>"
-    [visit] = tab.visit(small_page(tmp_path, before + picture), [WIDE])
-    assert ends + 300 < visit.picture < ends + 500
-    assert tab.visit(small_page(tmp_path), [WIDE])[0].picture is None  # a dot is no picture
 
 
 @pytest.mark.parametrize(
