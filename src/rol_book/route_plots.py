@@ -135,7 +135,9 @@ def draw_quality(
     axes[0].set_yticks([0.1, 1.0, 10.0, 100.0], ["0.1", "1", "10", "100"])
     axes[0].set_ylim(0.05, max(60.0, 1.3 * runs.rmse_m.max()))
     axes[1].set_ylim(0, 103)
-    axes[2].set_ylim(bottom=0)
+    axes[2].set_yscale("symlog", linthresh=1.0)
+    axes[2].set_yticks([0.0, 1.0, 10.0, 100.0], ["0", "1", "10", "100"])
+    axes[2].set_ylim(0.0, max(10.0, 1.3 * runs.failures.max()))
     for ax, corner in zip(axes, ("upper right", "lower right", "upper right"), strict=True):
         ax.legend(loc=corner)
     return figure
