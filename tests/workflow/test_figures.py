@@ -47,10 +47,13 @@ def test_narrow_windows_get_the_stacked_picture(figures: ModuleType, tmp_path: P
     (tmp_path / "_images").mkdir()
     Image.fromarray(picture_with(range(95, 106))).save(tmp_path / "_images" / "a.png")
     page = tmp_path / "notebooks" / "a.html"
-    page.write_text('<p><img alt="x" class="panels-2 y" src="../_images/a.png" /></p><img src="b.png" />')
+    page.write_text(
+        '<p><img alt="x" class="panels-2 y" src="../_images/a.png" /></p><img src="b.png" />',
+        encoding="utf-8",
+    )
     app = SimpleNamespace(outdir=tmp_path, builder=SimpleNamespace(format="html"))
     figures.add_stacked_pictures(app, None)
-    words = page.read_text()
+    words = page.read_text(encoding="utf-8")
     assert '(max-width: 700px)" srcset="../_images/a-stacked.png"><img alt="x"' in words
     assert words.count("<picture>") == 1
     with Image.open(tmp_path / "_images" / "a-stacked.png") as stacked:
