@@ -296,7 +296,7 @@ def describe(sessions: list[str], n_points: float, longest_m: float) -> dict[str
         "load when begun": os.getloadavg()[0],
         "sessions": sessions,
         "points per cloud": n_points,
-        "longest stretch [m]": longest_m,
+        "longest segment [m]": longest_m,
     }
 
 
