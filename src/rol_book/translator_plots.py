@@ -37,8 +37,9 @@ def draw_example(radar_image: np.ndarray, generated: np.ndarray, lidar: np.ndarr
         The figure.
     """
     figure, axes = plots.subplots(1, 2, height=4.7)
+    echoes = np.maximum(radar_image, NOISE_POWER) - NOISE_POWER
     for ax, size in zip(axes, (1.0, 7.0), strict=True):
-        plots.show_image(ax, radar_image, vmax=200)
+        plots.show_image(ax, echoes, vmax=150)
         plots.show_points(ax, lidar, colour=COLOURS["real"], size=size, label="lidar")
         plots.show_points(ax, generated, colour=COLOURS["fake"], size=size, label="generated")
     plots.zoom(plots.frame_square(axes[0], (12.0, 0.0), 18.0), (0.0, 0.0), 64.0)
