@@ -112,7 +112,6 @@ ALIGNMENT = OUT + "/alignment/{session}/alignment.csv"
 PAIRS, CORRECTED = (OUT + "/" + folder + "/{session}/pairs.json" for folder in ("pairs", "pairs-corrected"))
 GENERATED = OUT + "/fake/{session}/fake.json"
 NETWORK, SUMMARY, MAPS = f"{OUT}/pix2pix/generator.safetensors", f"{OUT}/maps/summary.json", OUT + "/maps/{session}.npz"
-FRONT_ENDS = f"{OUT}/similarity/front_ends.csv"
 TRUTH, METRICS = OUT + "/ground_truth/{session}.tum", OUT + "/localization/{session}/{method}/metrics.json"
 ALL_MADE = [session_made(session) for session in SESSIONS]
 
@@ -141,7 +140,7 @@ STEPS = {
             "weights": NETWORK,
             "shipped": SHIPPED,
         },
-        {"similarity": expand(OUT + "/similarity/{session}.json", session=SESSIONS), "front_ends": FRONT_ENDS},
+        {"similarity": expand(OUT + "/similarity/{session}.json", session=SESSIONS)},
     ),
     "ground_truth": (
         "06_ground_truth",
@@ -184,8 +183,10 @@ STEPS = {
         "ablations",
         {
             "tables": found("data/ablations/*.csv"),
+            "pairs": expand(PAIRS, session=SESSIONS),
+            "weights": NETWORK,
+            "shipped": SHIPPED,
             "cards": [str(Path(path).with_suffix(".json")) for path in SHIPPED],
-            "front_ends": FRONT_ENDS,
         },
         {},
     ),

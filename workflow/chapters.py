@@ -214,7 +214,7 @@ def translation(config: dict, notebooks: Path = NOTEBOOKS) -> dict[str, str]:
     defaults = notebook_parameters(notebooks / f"{chapter}.ipynb")
     known = defaults | run_parameters(config, Run(chapter), notebooks)
     weights = Path(known["weights_root"], f"{known['network']}.safetensors")
-    if known["network"] == "chapter 04":
+    if known["network"] == "chapter 4":
         weights = Path(config["out_dir"], "pix2pix", "generator.safetensors")
     options = [f"--{name}={str(known[name]).lower()}" for name in ("threshold", "device", "bf16")]
     return {"weights": str(weights), "options": shlex.join(options)}

@@ -38,11 +38,7 @@ CHOICES: dict[str, tuple[Any, ...]] = {  # parameter -> all its values
     "points_source": ("raw", "fake", "real", "fake-corrected"),
 }
 MAY_BE_ZERO = ("seed", "twin_seed", "scan_number", "kidnapped_at", "gap_scans", "steps", "n_blocks")
-NETWORKS = {
-    "network": "safetensors",
-    "compared": "safetensors",
-    "networks": "json",
-}  # parameter -> file it needs
+NETWORKS = ("network", "compared", "networks")  # parameters that name networks
 
 
 class ParameterError(ValueError):
@@ -214,16 +210,17 @@ def _session_faults(parameters: dict[str, Any]) -> list[str]:
 
 
 def _network_faults(parameters: dict[str, Any]) -> list[str]:
-    """List the networks that have no file in the folder of the weights; "chapter 04" trains its own."""
+    """List the networks that have no file in the folder of the weights; "chapter 4" trains its own."""
     if "weights_root" not in parameters:
         return []
-    faults = []
-    for name in parameters.keys() & NETWORKS.keys():
-        value, root, ending = parameters[name], Path(parameters["weights_root"]), NETWORKS[name]
+    root, faults = Path(parameters["weights_root"]), []
+    for name in [name for name in NETWORKS if name in parameters]:
+        value = parameters[name]
         faults += [
-            f"{name}: {network!r} has no file {root / f'{network}.{ending}'}; there are: "
-            + (", ".join(sorted(path.stem for path in root.glob(f"[!.]*.{ending}"))) or "none")
+            f"{name}: {network!r} has no file {root / f'{network}.safetensors'}; there are: "
+            + (", ".join(sorted(path.stem for path in root.glob("[!.]*.safetensors"))) or "none")
+            + (", and the network of 'chapter 4'" if name == "network" else "")
             for network in ([value] if isinstance(value, str) else value)
-            if network != "chapter 04" and not (root / f"{network}.{ending}").is_file()
+            if network != "chapter 4" and not (root / f"{network}.safetensors").is_file()
         ]
     return faults

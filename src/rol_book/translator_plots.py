@@ -162,15 +162,17 @@ def draw_thresholds(table: pd.DataFrame, used: int) -> Figure:
     return figure
 
 
-def draw_front_ends(points: pd.DataFrame, names: Mapping[str, str], half: float = 45.0) -> Figure:
-    """Draw the points of front ends over the lidar points: near ones and others, a panel each.
+def draw_networks(
+    clouds: Mapping[str, tuple[np.ndarray, np.ndarray]], lidar: np.ndarray, half: float = 45.0
+) -> Figure:
+    """Draw the points of networks over the lidar points: near ones and others, a panel each.
 
     Parameters
     ----------
-    points : pandas.DataFrame
-        Of `rol_study.session_similarity.with_distances`.
-    names : mapping of str to str
-        Front ends -> titles of their panels.
+    clouds : mapping of str to tuple
+        Network -> points, shape (n, 2) [m], and their distances to the nearest lidar point, shape (n,) [m].
+    lidar : array, shape (m, 2)
+        Lidar points [m].
     half : float
         Half the edge of the square shown [m].
 
@@ -179,17 +181,14 @@ def draw_front_ends(points: pd.DataFrame, names: Mapping[str, str], half: float 
     figure : Figure
         The figure.
     """
-    n_columns = len(names) if len(names) < 4 else 2
-    n_rows = -(-len(names) // n_columns)
-    figure, axes = plots.subplots(n_rows, n_columns, height=n_rows * 8.4 / n_columns, squeeze=False)
-    clouds = {name: table for name, table in points.groupby("front_end")}
-    for ax, (name, title) in zip(axes.flat, names.items(), strict=False):
-        cloud, near = clouds[name], clouds[name].distance_m < 1.0
-        layers = [(clouds["lidar"], "#B5B5B5", 0.6)]
-        layers += [(cloud[near], COLOURS["fake"], 1.6), (cloud[~near], COLOURS["estimate"], 1.6)]
-        for table, colour, size in layers:
-            plots.show_points(ax, table[["x_m", "y_m"]].to_numpy(), colour=colour, size=size)
-        plots.zoom(ax, (0.0, 0.0), half).set_title(title)
+    n_rows = -(-len(clouds) // 2)
+    figure, axes = plots.subplots(n_rows, 2, height=4.2 * n_rows, squeeze=False)
+    for ax, (name, (points, distances)) in zip(axes.flat, clouds.items(), strict=False):
+        plots.show_points(ax, lidar, colour="#B5B5B5", size=0.6)
+        near = distances < 1.0
+        plots.show_points(ax, points[near], colour=COLOURS["fake"], size=1.6)
+        plots.show_points(ax, points[~near], colour=COLOURS["estimate"], size=1.6)
+        plots.zoom(ax, (0.0, 0.0), half).set_title(name)
     return figure
 
 

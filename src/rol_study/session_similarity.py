@@ -1,8 +1,8 @@
-"""Compare the generated points of whole sessions with the lidar points: precision, recall and controls."""
+"""Compare the points of whole sessions with the lidar points: generated points, controls and networks."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -16,30 +16,26 @@ from rol.oxford import load_radar, open_session
 from rol.pairs import list_pairs, load_pair, read_image, read_points
 from rol.pix2pix import TrainedNetwork, generate
 from rol.similarity import distance_histogram, nn_distances, similarity_summary, summarize_distances
-from rol_beyond.front_ends import detect_points
+from rol_beyond.front_ends import DETECTORS, detect_points
 
 SPEEDS = {"below 1": 1.0, "1 to 4": 4.0, "4 to 7": 7.0, "above 7": np.inf}  # classes and their ends [m/s]
 
 
 @dataclass(frozen=True)
-class GeneratedSession:
-    """A session whose images were generated.
+class PairedSession:
+    """A session whose pairs were made.
 
     Attributes
     ----------
     name : str
         Name of the session.
-    in_dir, out_dir : path
-        Folders with the results of earlier chapters (``pairs``, ``pairs-corrected``, ``alignment``), and with
-        the generated images (``fake``).
-    points : mapping
-        ``threshold`` and ``thin`` of `rol.bev.image_to_points`, for the generated images.
+    in_dir : path
+        Folder with the results of earlier chapters: ``pairs``, and for `compare_compensated` also
+        ``pairs-corrected`` and ``alignment``.
     """
 
     name: str
     in_dir: str | Path
-    out_dir: str | Path
-    points: Mapping[str, Any]
 
     @cached_property
     def stamps_us(self) -> list[int]:
@@ -54,6 +50,27 @@ class GeneratedSession:
         """Read the radar image and the lidar image of a scan, shape (w, w), uint8."""
         return load_pair(Path(self.in_dir, "pairs", self.name), us)
 
+    def lidar(self, us: int) -> np.ndarray:
+        """Read the lidar points of a scan, shape (m, 2) [m]."""
+        return image_to_points(self.pair(us)[1])
+
+
+@dataclass(frozen=True)
+class GeneratedSession(PairedSession):
+    """A session whose lidar images were generated.
+
+    Attributes
+    ----------
+    out_dir, sessions_root : path
+        Folder with the generated images (``fake``), and folder of the sessions.
+    points : mapping
+        ``threshold`` and ``thin`` of `rol.bev.image_to_points`, for the generated images.
+    """
+
+    out_dir: str | Path
+    sessions_root: str | Path
+    points: Mapping[str, Any]
+
     def image(self, us: int) -> np.ndarray:
         """Read the generated image of a scan, shape (w, w), uint8."""
         return read_image(Path(self.out_dir, "fake", self.name, f"{us}.png"))
@@ -62,9 +79,10 @@ class GeneratedSession:
         """Convert the generated image into points, shape (n, 2) [m]; options replace those of `points`."""
         return image_to_points(self.image(us), **{**self.points, **points})
 
-    def lidar(self, us: int) -> np.ndarray:
-        """Read the lidar points of a scan, shape (m, 2) [m]."""
-        return image_to_points(self.pair(us)[1])
+    def detected(self, us: int) -> dict[str, np.ndarray]:
+        """Detect points in the polar scan by each of `rol_beyond.front_ends.DETECTORS`, shape (n, 2) [m]."""
+        scan = load_radar(open_session(Path(self.sessions_root, self.name)).radar_path(us))
+        return {name: detect_points(scan.power, scan.azimuths, detector=name) for name in DETECTORS}
 
 
 def compare_scans(session: GeneratedSession, edges: np.ndarray) -> tuple[pd.DataFrame, np.ndarray]:
@@ -118,7 +136,7 @@ def brightest_pixels(radar_image: np.ndarray, n: int, pixel_size: float = 0.25) 
 
 
 def compare_controls(sessions: Iterable[GeneratedSession], n_scans: int) -> pd.DataFrame:
-    """Compare generated points with two controls.
+    """Compare generated points and controls with the lidar points.
 
     Parameters
     ----------
@@ -132,7 +150,7 @@ def compare_controls(sessions: Iterable[GeneratedSession], n_scans: int) -> pd.D
     table : pandas.DataFrame
         One row per scan and kind of ``points``, with the columns of `rol.similarity.similarity_summary`:
         "fake" (generated points), "brightest" (as many pixels of the radar image, see `brightest_pixels`),
-        and "chance" (generated points against the lidar points half a session away).
+        "chance" (generated points against the lidar points half a session away), and the detectors.
     """
     rows = []
     for session in sessions:
@@ -144,6 +162,7 @@ def compare_controls(sessions: Iterable[GeneratedSession], n_scans: int) -> pd.D
                 "fake": (points, real),
                 "brightest": (brightest_pixels(radar, len(points)), real),
                 "chance": (points, session.lidar(other_us)),
+                **{name: (peaks, real) for name, peaks in session.detected(us).items()},
             }
             rows += [{"points": name, **similarity_summary(*two)} for name, two in clouds.items()]
     return pd.DataFrame(rows)
@@ -207,95 +226,60 @@ def compare_thresholds(
     return pd.DataFrame(rows).groupby("threshold").mean()
 
 
-def front_end_clouds(
-    session: GeneratedSession,
-    us: int,
-    sessions_root: str | Path,
-    networks: Mapping[str, TrainedNetwork],
-    chosen: str,
-    bf16: bool = False,
+def network_points(
+    radar_image: np.ndarray, networks: Mapping[str, TrainedNetwork], bf16: bool = False
 ) -> dict[str, np.ndarray]:
-    """Convert one scan into points by peak detectors and by networks.
+    """Convert a radar image into points by several networks.
 
     Parameters
     ----------
-    session : GeneratedSession
-        The session.
-    us : int
-        Stamp of the scan [us].
-    sessions_root : path
-        Folder of the sessions, for the polar scan.
+    radar_image : array, shape (w, w), uint8
+        Power.
     networks : mapping of str to TrainedNetwork
         The networks by name.
-    chosen : str
-        Name of the network whose images of the session exist; of a network that thins its strokes, points
-        without thinning are added.
     bf16 : bool
         Compute in bfloat16.
 
     Returns
     -------
     clouds : dict of array, shape (n, 2)
-        "k strongest", "CFAR", and the names of the networks -> points in the radar frame [m].
+        Name -> points in the radar frame [m]; of a network that thins its strokes also without thinning, as
+        "<name>, not thinned".
     """
-    scan = load_radar(open_session(Path(sessions_root, session.name)).radar_path(us))
-    clouds = {"k strongest": detect_points(scan.power, scan.azimuths)}
-    clouds["CFAR"] = detect_points(scan.power, scan.azimuths, detector="cfar")
+    clouds = {}
     for name, network in networks.items():
-        if name == chosen:
-            clouds[name] = session.generated(us)
-        else:
-            image = generate(network.generator, session.pair(us)[0], bf16=bf16)
-            clouds[name] = image_to_points(image, **network.points)
-    if chosen in networks and session.points["thin"]:
-        clouds[f"{chosen}, not thinned"] = session.generated(us, thin=False)
+        image = generate(network.generator, radar_image, bf16=bf16)
+        clouds[name] = image_to_points(image, **network.points)
+        if network.points["thin"]:
+            clouds[f"{name}, not thinned"] = image_to_points(image, **{**network.points, "thin": False})
     return clouds
 
 
-def compare_front_ends(
-    clouds: Iterable[tuple[str, int, Mapping[str, np.ndarray]]], sessions: Mapping[str, GeneratedSession]
-) -> pd.DataFrame:
-    """Compare the points of front ends with the lidar points.
+def compare_networks(
+    sessions: Iterable[PairedSession],
+    n_scans: int,
+    networks: Mapping[str, TrainedNetwork],
+    bf16: bool = False,
+) -> Iterator[dict[str, Any]]:
+    """Compare the points of networks with the lidar points.
 
     Parameters
     ----------
-    clouds : iterable of (str, int, mapping)
-        Session, stamp [us] and the points of every front end.
-    sessions : mapping of str to GeneratedSession
-        The sessions by name.
+    sessions : iterable of PairedSession
+        The sessions.
+    n_scans : int
+        Scans per session.
+    networks, bf16
+        As of `network_points`.
 
-    Returns
-    -------
-    table : pandas.DataFrame
-        One row per scan and front end: ``session``, ``radar_stamp_us``, ``front_end``, and the columns of
+    Yields
+    ------
+    row : dict
+        One per scan and network: ``session``, ``radar_stamp_us``, ``network``, and the entries of
         `rol.similarity.similarity_summary`.
     """
-    rows = []
-    for name, us, points in clouds:
-        lidar = sessions[name].lidar(us)
-        about = {"session": name, "radar_stamp_us": us}
-        rows += [{**about, "front_end": f, **similarity_summary(p, lidar)} for f, p in points.items()]
-    return pd.DataFrame(rows)
-
-
-def with_distances(clouds: Mapping[str, np.ndarray], lidar: np.ndarray) -> pd.DataFrame:
-    """List the points of front ends with their distances to the lidar points, which come first.
-
-    Parameters
-    ----------
-    clouds : mapping of str to array, shape (n, 2)
-        Points of every front end [m].
-    lidar : array, shape (m, 2)
-        Lidar points [m].
-
-    Returns
-    -------
-    table : pandas.DataFrame
-        One row per point: ``front_end`` ("lidar" for the lidar points), ``x_m``, ``y_m`` and ``distance_m``.
-    """
-    tables = []
-    for name, points in {"lidar": lidar, **clouds}.items():
-        table = pd.DataFrame(points, columns=["x_m", "y_m"])
-        table["distance_m"] = nn_distances(points, lidar)
-        tables.append(table.assign(front_end=name))
-    return pd.concat(tables, ignore_index=True)[["front_end", "x_m", "y_m", "distance_m"]]
+    for session in sessions:
+        for us in session.sample(n_scans):
+            about, lidar = {"session": session.name, "radar_stamp_us": us}, session.lidar(us)
+            for name, points in network_points(session.pair(us)[0], networks, bf16).items():
+                yield {**about, "network": name, **similarity_summary(points, lidar)}

@@ -188,7 +188,7 @@ def test_profiles_pass_what_the_notebooks_accept(profile: Path, monkeypatch: pyt
 
 
 def test_zero_means_something_for_a_seed_and_below_zero_for_a_height(defaults: dict) -> None:
-    check_parameters("x", {**defaults, "seed": 0, "low_m": -2.0, "network": "chapter 04"})
+    check_parameters("x", {**defaults, "seed": 0, "low_m": -2.0, "network": "chapter 4"})
 
 
 def test_text_is_no_value_of_bf16() -> None:

@@ -8,6 +8,7 @@ import pytest
 
 pytest.importorskip("torch")
 
+from rol.pix2pix import TrainedNetwork
 from rol_study import session_similarity as similarity
 from rol_study.session_similarity import GeneratedSession
 
@@ -31,10 +32,13 @@ class MadeUpSession(GeneratedSession):
         generated[22 + us, 20:30] = 140
         return generated
 
+    def detected(self, us: int) -> dict[str, np.ndarray]:
+        return {"cfar": self.lidar(us)[:3]}
+
 
 @pytest.fixture
 def session() -> MadeUpSession:
-    return MadeUpSession("made-up", "", "", {"threshold": 128, "thin": False})
+    return MadeUpSession("made-up", "", "", "", {"threshold": 128, "thin": False})
 
 
 def test_scans_are_compared_both_ways(session: MadeUpSession) -> None:
@@ -59,22 +63,29 @@ def test_brightest_pixels_are_those_of_the_echo(session: MadeUpSession) -> None:
 def test_controls_are_worse_than_the_points_only_where_they_should_be(session: MadeUpSession) -> None:
     means = similarity.compare_controls([session], 4).groupby("points").fake_to_real_within_1m.mean()
     assert means["fake"] == 0.5 and means["brightest"] == 0.5  # half of as many pixels are empty
-    assert means["chance"] <= 0.5
+    assert means["chance"] <= 0.5 and means["cfar"] == 1.0
 
 
-def test_front_ends_are_rows_with_distances(session: MadeUpSession) -> None:
-    clouds = {"k strongest": np.array([[5.0, 0.0]]), "unet": session.generated(1)}
-    table = similarity.compare_front_ends([("made-up", 1, clouds)], {"made-up": session})
-    assert table.front_end.tolist() == ["k strongest", "unet"] and table.n_fake.tolist() == [1, 20]
-    points = similarity.with_distances(clouds, session.lidar(1))
-    assert points.groupby("front_end").size().to_dict() == {"k strongest": 1, "lidar": 20, "unet": 20}
-    assert (points[points.front_end == "lidar"].distance_m == 0.0).all()
+def test_networks_are_compared_with_and_without_thinning(
+    session: MadeUpSession, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stroke = np.zeros((64, 64), dtype=np.uint8)
+    stroke[11:14, 20:30] = [[150], [200], [150]]
+    monkeypatch.setattr(similarity, "generate", lambda generator, image, bf16: stroke)
+    networks = {
+        "plain": TrainedNetwork(None, {"threshold": 180, "thin": False}, {}, {}),
+        "thin": TrainedNetwork(None, {"threshold": 128, "thin": True}, {}, {}),
+    }
+    table = pd.DataFrame(similarity.compare_networks([session], 1, networks))
+    assert table.network.tolist() == ["plain", "thin", "thin, not thinned"]
+    assert table.n_fake.tolist() == [10, 14, 30] and (table.n_real == 20).all()  # ends keep their corners
+    assert (table.fake_to_real_within_1m == 1.0).all() and (table.radar_stamp_us == 1).all()
 
 
 def test_motion_is_compensated_before_points_are_compared(
     session: MadeUpSession, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    moving = GeneratedSession("made-up", tmp_path, tmp_path, session.points)
+    moving = GeneratedSession("made-up", tmp_path, tmp_path, "", session.points)
     moving.__dict__["stamps_us"] = [1, 2]
     (tmp_path / "alignment" / "made-up").mkdir(parents=True)
     motion = {"radar_stamp_us": [1, 2], "vx_mps": [0.5, 9.0], "vy_mps": 0.0, "yaw_rate_radps": 0.1}

@@ -396,7 +396,7 @@ def test_generated_images_take_the_network_and_options_of_chapter_05() -> None:
         "options": "--threshold=0 --device=cpu --bf16=auto",
     }
     assert chapters.translation(config) == default
-    config["notebooks"]["05_real_vs_fake"] |= {"network": "chapter 04", "bf16": False, "device": "cuda"}
+    config["notebooks"]["05_real_vs_fake"] |= {"network": "chapter 4", "bf16": False, "device": "cuda"}
     assert chapters.translation(config) == {
         "weights": "build/smoke/pix2pix/generator.safetensors",
         "options": "--threshold=0 --device=cuda --bf16=false",
@@ -408,7 +408,7 @@ def test_network_of_chapter_04_is_trained_before_its_images_are_generated(
     workplace: Path, out_dir: str
 ) -> None:
     config = chapters.load_config(ROOT / "config/smoke.yaml") | {"out_dir": out_dir}
-    config["notebooks"]["05_real_vs_fake"] |= {"network": "chapter 04"}
+    config["notebooks"]["05_real_vs_fake"] |= {"network": "chapter 4"}
     (workplace / "own.yaml").write_text(yaml.safe_dump(config), encoding="utf-8")
     made = "build/smoke/fake/sim-town-seq01/fake.json"
     answer = snakemake(workplace, "-n", "--quiet", "rules", "--configfile", "own.yaml", "--", made)
