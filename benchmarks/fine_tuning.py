@@ -20,7 +20,7 @@ from rol.files import write_text
 from rol.pix2pix import has_bf16, load_network
 from rol_book.parameters import positive
 from rol_data.rall import find_real_root
-from rol_study.fine_tuning import SETTINGS, load_test_scans, load_training_pairs, run_study
+from rol_study.fine_tuning import SETTINGS, load_test_pairs, load_training_pairs, run_study
 
 DATA = Path(__file__).resolve().parents[1] / "data"
 FIRST = ["seed", "steps", "source", "threshold", "n_scans"]
@@ -39,10 +39,10 @@ def main() -> None:
     if root is None:
         raise SystemExit("the real pairs are not at hand: run `make real`, or give --real-root")
     network = load_network(DATA / "weights" / "unet.safetensors")
-    pairs, scans = load_training_pairs(root), load_test_scans(root)
+    pairs, others = load_training_pairs(root), load_test_pairs(root)
     counts, seeds = sorted(int(word) for word in given.steps.split(",")), range(1, given.seeds + 1)
     tables, begin = [], perf_counter()
-    for table in run_study(network, pairs, scans, seeds, counts, replace(SETTINGS, bf16=has_bf16())):
+    for table in run_study(network, pairs, others, seeds, counts, replace(SETTINGS, bf16=has_bf16())):
         tables.append(table)
         every = pd.concat(tables, ignore_index=True)
         every = every[[*FIRST, *(name for name in every if name not in FIRST)]]

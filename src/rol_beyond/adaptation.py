@@ -32,7 +32,7 @@ class RealPair:
     power, azimuths : array, shape (a, b) and (a,)
         Power in half-dB steps, and counter-clockwise bearings of the rows [rad].
     points : array, shape (n, 2)
-        Lidar points without the ground, in the radar frame [m]; at mid-scan if there is a twist.
+        Lidar or map points without the ground, in the radar frame [m]; at mid-scan if there is a twist.
     twist : tuple of float, optional
         Body velocity for the motion compensation of the scan [m/s, m/s, rad/s]; without it there is none.
     """

@@ -7,10 +7,9 @@ of RADIATE, another radar in fog.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -37,37 +36,6 @@ THRESHOLDS = (96, 112, 128, 144, 160, 176, 192, 208, 224)  # grey values
 SETTINGS = AdaptationConfig(reach_m=40.0, steps=400, batch_size=2)
 
 
-@dataclass(frozen=True, eq=False)
-class TestScan:
-    """A radar scan with the points that generated points are compared with.
-
-    Attributes
-    ----------
-    source : str
-        Name of the group over which results are averaged.
-    power, azimuths : array, shape (a, b) and (a,)
-        Power in half-dB steps, and counter-clockwise bearings of the rows [rad].
-    reference : array, shape (n, 2)
-        Lidar or map points in the radar frame [m].
-    max_range_m : float
-        Range up to which points are compared [m].
-    twist : tuple of float, optional
-        Body velocity for the motion compensation [m/s, m/s, rad/s].
-    settings : mapping
-        Settings of the radar image that differ from the network's.
-    """
-
-    __test__ = False  # not a class of tests
-
-    source: str
-    power: np.ndarray
-    azimuths: np.ndarray
-    reference: np.ndarray
-    max_range_m: float = MAX_RANGE_M
-    twist: tuple[float, float, float] | None = None
-    settings: Mapping[str, Any] = field(default_factory=dict)
-
-
 def load_training_pairs(real_root: Path | str) -> list[RealPair]:
     """Read the real Oxford pairs, motion-compensated, with all lidar sweeps of each turn.
 
@@ -90,7 +58,7 @@ def load_training_pairs(real_root: Path | str) -> list[RealPair]:
     return pairs
 
 
-def load_test_scans(real_root: Path | str) -> list[TestScan]:
+def load_test_pairs(real_root: Path | str) -> dict[str, list[RealPair]]:
     """Read the real scans for the evaluation: "map" (posed scans on the map) and "fog" (RADIATE).
 
     Parameters
@@ -100,28 +68,21 @@ def load_test_scans(real_root: Path | str) -> list[TestScan]:
 
     Returns
     -------
-    scans : list of TestScan
-        The scans of `rol_data.rall.load_posed_scans`, then the pairs of `rol_data.radiate.load_pairs`.
+    pairs : dict of list of RealPair
+        By source: the scans of `rol_data.rall.load_posed_scans` with the map points around them, and the
+        pairs of `rol_data.radiate.load_pairs`.
     """
     map_points = load_map_points(Path(real_root) / MAP_PATH)
     tree = cKDTree(map_points)
-    scans = [place_on_map(scan, map_points, tree) for scan in load_posed_scans(real_root)]
-    for pair in load_pairs(real_root):
-        sweep, azimuths = lidar_points(pair), radiate_azimuths()
-        scans.append(TestScan("fog", pair.power, azimuths, sweep, FOG_RANGE_M, settings=FOG))
-    return scans
+    placed = [place_on_map(scan, map_points, tree) for scan in load_posed_scans(real_root)]
+    foggy = [RealPair(pair.power, radiate_azimuths(), lidar_points(pair)) for pair in load_pairs(real_root)]
+    return {"map": placed, "fog": foggy}
 
 
-def place_on_map(scan: RealScan, map_points: np.ndarray, tree: cKDTree) -> TestScan:
-    """Compare a scan with the part of a map around its pose, moved into the radar frame."""
+def place_on_map(scan: RealScan, map_points: np.ndarray, tree: cKDTree) -> RealPair:
+    """Pair a scan with the part of a map around its pose, moved into the radar frame."""
     near = crop_map(map_points, tree, scan.pose[None], MAX_RANGE_M + MARGIN_M)
-    reference = transform_points(invert(scan.pose), near)
-    return TestScan("map", scan.power, scan.azimuths, reference, twist=scan.twist)
-
-
-def known_scans(pairs: Iterable[RealPair]) -> list[TestScan]:
-    """Compare the training pairs with their own lidar points, as the source "pairs"."""
-    return [TestScan("pairs", pair.power, pair.azimuths, pair.points, twist=pair.twist) for pair in pairs]
+    return RealPair(scan.power, scan.azimuths, transform_points(invert(scan.pose), near), scan.twist)
 
 
 def compare_within(points: np.ndarray, reference: np.ndarray, max_range_m: float) -> dict[str, float]:
@@ -149,7 +110,7 @@ def compare_within(points: np.ndarray, reference: np.ndarray, max_range_m: float
 
 def evaluate_scans(
     network: TrainedNetwork,
-    scans: Iterable[TestScan],
+    pairs: Mapping[str, Sequence[RealPair]],
     thresholds: Sequence[int] = THRESHOLDS,
     bf16: bool = False,
 ) -> pd.DataFrame:
@@ -159,8 +120,9 @@ def evaluate_scans(
     ----------
     network : TrainedNetwork
         The network.
-    scans : iterable of TestScan
-        The scans.
+    pairs : mapping of str to sequence of RealPair
+        Scans with lidar or map points, by source. Those of "fog" are compared up to `FOG_RANGE_M`, with the
+        settings `rol_study.real_scans.FOG`.
     thresholds : sequence of int
         Grey values from which on a pixel is a point.
     bf16 : bool
@@ -173,16 +135,17 @@ def evaluate_scans(
         of `compare_within`.
     """
     rows = []
-    for scan in scans:
-        own = replace(network, settings={**network.settings, **scan.settings})
-        image = generate_points(own, scan.power, scan.azimuths, scan.twist, bf16=bf16)[2]
-        size = {
-            name: getattr(PairSettings.from_dict(own.settings), name) for name in ("pixel_size", "max_range")
-        }
+    for source, pair in ((source, pair) for source, group in pairs.items() for pair in group):
+        own, max_range_m = network, MAX_RANGE_M
+        if source == "fog":
+            own, max_range_m = replace(network, settings={**network.settings, **FOG}), FOG_RANGE_M
+        image = generate_points(own, pair.power, pair.azimuths, pair.twist, bf16=bf16)[2]
+        settings = PairSettings.from_dict(own.settings)
+        size = {"pixel_size": settings.pixel_size, "max_range": settings.max_range}
         for level in thresholds:
             how = {**network.points, "threshold": int(level), "min_range": MIN_RANGE_M, **size}
-            scores = compare_within(image_to_points(image, **how), scan.reference, scan.max_range_m)
-            rows.append({"source": scan.source, "threshold": int(level), **scores})
+            scores = compare_within(image_to_points(image, **how), pair.points, max_range_m)
+            rows.append({"source": source, "threshold": int(level), **scores})
     groups = pd.DataFrame(rows).groupby(["source", "threshold"], sort=False)
     return groups.mean().assign(n_scans=groups.size()).reset_index()
 
@@ -230,7 +193,7 @@ def fine_tune(
 def run_study(
     network: TrainedNetwork,
     pairs: Sequence[RealPair],
-    scans: Sequence[TestScan],
+    others: Mapping[str, Sequence[RealPair]],
     seeds: Sequence[int],
     step_counts: Sequence[int],
     config: AdaptationConfig = SETTINGS,
@@ -243,8 +206,8 @@ def run_study(
         The network.
     pairs : sequence of RealPair
         Pairs to train on; they are evaluated, too, as the source "pairs".
-    scans : sequence of TestScan
-        Other scans.
+    others : mapping of str to sequence of RealPair
+        Other scans by source, as of `load_test_pairs`.
     seeds, step_counts : sequence of int
         As of `fine_tune`; the network as it is is evaluated once, with the seed 0.
     config : AdaptationConfig
@@ -255,7 +218,7 @@ def run_study(
     table : pandas.DataFrame
         As of `evaluate_scans`, with ``seed`` and ``steps``.
     """
-    every = [*known_scans(pairs), *scans]
+    every = {"pairs": pairs, **others}
     for seed in (0, *seeds):
         counts = [0] if seed == 0 else [count for count in step_counts if count > 0]
         for steps, tuned in fine_tune(network, pairs, seed, counts, config):

@@ -11,7 +11,6 @@ from rol.pix2pix import TrainedNetwork, build_generator
 from rol_beyond import unet  # noqa: F401 (registers its architecture)
 from rol_beyond.adaptation import AdaptationConfig, RealPair
 from rol_study import fine_tuning
-from rol_study.fine_tuning import TestScan
 
 pytestmark = pytest.mark.torch
 AZIMUTHS = -2.0 * np.pi * np.arange(400) / 400
@@ -66,12 +65,13 @@ def test_fine_tuning_stops_at_the_asked_steps_and_leaves_the_network_alone(netwo
 
 def test_study_evaluates_every_seed_and_source(network: TrainedNetwork) -> None:
     pairs = [RealPair(make_power(), AZIMUTHS, WALL)]
-    other = TestScan("other", make_power(), AZIMUTHS, WALL, 25.0)
-    tables = list(fine_tuning.run_study(network, pairs, [other, other], (1, 2), (0, 20), CONFIG))
+    tables = list(fine_tuning.run_study(network, pairs, {"fog": pairs * 2}, (1, 2), (0, 20), CONFIG))
     assert [(t.seed[0], t.steps[0]) for t in tables] == [(0, 0), (1, 20), (2, 20)]
-    assert all(t.source.unique().tolist() == ["pairs", "other"] for t in tables)
-    assert tables[0].set_index("source").n_scans.to_dict() == {"pairs": 1, "other": 2}
-    counts = [t[t.source == "other"].n_points.tolist() for t in tables]
+    assert all(t.source.unique().tolist() == ["pairs", "fog"] for t in tables)
+    assert tables[0].set_index("source").n_scans.to_dict() == {"pairs": 1, "fog": 2}
+    counts = [t[t.source == "fog"].n_points.tolist() for t in tables]
+    own = tables[0][tables[0].source == "pairs"].n_points.tolist()
+    assert own != counts[0]  # the same scans, but with the range resolution of the radar in fog
     assert counts[0] == sorted(counts[0], reverse=True)  # fewer points at higher thresholds
     assert counts[0] != counts[1] != counts[2]
 
@@ -86,9 +86,9 @@ def test_motion_of_a_pair_is_compensated(network: TrainedNetwork) -> None:
 
 
 def test_real_sources_are_found_and_placed(real_root: Path) -> None:
-    pairs, scans = fine_tuning.load_training_pairs(real_root), fine_tuning.load_test_scans(real_root)
+    pairs, others = fine_tuning.load_training_pairs(real_root), fine_tuning.load_test_pairs(real_root)
     assert len(pairs) == 11 and all(pair.twist is not None for pair in pairs)
     assert min(np.hypot(*pair.points.T).min() for pair in pairs) >= 2.5
-    assert [scan.source for scan in scans] == ["map"] + ["fog"] * 18
-    assert scans[0].twist is not None and np.hypot(*scans[0].reference.T).max() <= 74.0
-    assert scans[1].settings["range_offset"] == 0.0 and scans[1].max_range_m == 20.0
+    assert {source: len(group) for source, group in others.items()} == {"map": 1, "fog": 18}
+    assert others["map"][0].twist is not None and np.hypot(*others["map"][0].points.T).max() <= 74.0
+    assert others["fog"][0].twist is None
