@@ -216,6 +216,8 @@ def translation(config: dict, notebooks: Path = NOTEBOOKS) -> dict[str, str]:
     weights = Path(known["weights_root"], f"{known['network']}.safetensors")
     if known["network"] == "chapter 4":
         weights = Path(config["out_dir"], "pix2pix", "generator.safetensors")
+    elif not weights.is_file():
+        raise ChapterError(f"{chapter}: network: no file {weights}; that of chapter 4 is named 'chapter 4'")
     options = [f"--{name}={str(known[name]).lower()}" for name in ("threshold", "device", "bf16")]
     return {"weights": str(weights), "options": shlex.join(options)}
 

@@ -401,6 +401,9 @@ def test_generated_images_take_the_network_and_options_of_chapter_05() -> None:
         "weights": "build/smoke/pix2pix/generator.safetensors",
         "options": "--threshold=0 --device=cuda --bf16=false",
     }
+    config["notebooks"]["05_real_vs_fake"]["network"] = "chapter 04"
+    with pytest.raises(chapters.ChapterError, match=r"05_real_vs_fake: network: no file .*'chapter 4'"):
+        chapters.translation(config)
 
 
 @pytest.mark.parametrize("out_dir", ["build/smoke", "./build/smoke/"])
