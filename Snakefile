@@ -210,11 +210,11 @@ BEFORE = {  # commands that come before papermill
         for folder in ("pairs", "pairs-corrected")
     )
 }
-# Chapter 05 takes longest and needs all sessions, so these come first. All others have 0; those with -1 are needed by no
-# other chapter and fill gaps.
+# The longest chapters, 04, 10 and 13, wait for sessions and pairs, so these come first. All others have 0; those with -1
+# need no training, are needed by no other chapter, and fill gaps.
 FIRST, NEXT = 3, 2
-PRIORITIES = {"alignment": FIRST, "ground_removal": FIRST, "real_vs_fake": NEXT} | dict.fromkeys(
-    ("real_pairs", "oxford_route", "robust_filter", "ablations", "runtime", "simulator"), -1
+PRIORITIES = {"alignment": FIRST, "ground_removal": FIRST} | dict.fromkeys(
+    ("real_pairs", "oxford_route", "robust_filter", "runtime", "simulator"), -1
 )
 
 
