@@ -643,7 +643,7 @@ def draw_speeds(ax: Axes, drives: Sequence[tuple[np.ndarray, np.ndarray]], names
         ax.fill_between(times, base, base + speeds, color=colour, alpha=0.85, linewidth=0)
         ax.text(0.0, base + 9.9, names[index], fontsize=9.5)
     ax.set(
-        title="speed; a strip is 12 m/s high",
+        title="speed (strips of 12 m/s)",
         xlabel="time since the first scan [s]",
         ylim=(-12.0 * len(drives) + 11.0, 12.5),
     )
