@@ -101,7 +101,7 @@ def draw_network(ax: Axes, layers: list[Layer], title: str = "") -> Axes:
     for place, layer in enumerate(layers):
         tall = 0.2 + 0.8 * np.log2(max(layer.height, 16) / 16) / np.log2(512 / 16)
         wide = 0.10 + 0.09 * np.log2(layer.channels)
-        copies = min(layer.repeats, 3)  # a stack of boxes stands for several layers
+        copies = min(layer.repeats, 3)  # a stack of boxes for repeated layers
         for copy in reversed(range(copies)):
             corner = (place - wide / 2 + 0.05 * copy, -tall / 2 + 0.03 * copy)
             box = Rectangle(corner, wide, tall, facecolor=KIND_COLOURS[layer.kind], edgecolor="#333333")
@@ -120,20 +120,12 @@ def draw_network(ax: Axes, layers: list[Layer], title: str = "") -> Axes:
     return ax
 
 
-def count_weights(network: nn.Module) -> int:
-    """Count the weights of a network."""
-    return sum(weight.numel() for weight in network.parameters())
-
-
 def _name_layer(module: nn.Module) -> tuple[str, str]:
-    """Name a layer: its kind, and what stands above its box."""
+    """Return the kind of a layer and its label."""
     if isinstance(module, ResidualBlock):
         return "residual", "residual\nblock"
     is_up = isinstance(module, nn.ConvTranspose2d)
     kernel, stride = module.kernel_size[0], module.stride[0]
     change = "" if stride == 1 else f", {'x' if is_up else '/'} {stride}"
-    return (
-        ("conv up", f"up-conv\n{kernel} x {kernel}{change}")
-        if is_up
-        else ("conv", f"conv\n{kernel} x {kernel}{change}")
-    )
+    kind, name = ("conv up", "up-conv") if is_up else ("conv", "conv")
+    return kind, f"{name}\n{kernel} x {kernel}{change}"

@@ -15,6 +15,7 @@ from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.quiver import Quiver
+from matplotlib.ticker import LogLocator
 
 # Distinct for colour-blind readers, and by lightness on grey paper (Okabe and Ito 2008).
 COLOURS = {
@@ -470,36 +471,21 @@ def draw_losses(
         The axes.
     """
     left, right = axes
-    left.plot(
-        history["step"], history["loss_l1"], color=COLOURS["fake"], marker="o", markersize=3, label="training"
+    lines = (
+        (left, "loss_l1", "training", "fake", "o"),
+        (left, "held_out_l1", "held out", "real", "s"),
+        (right, "loss_gan", "generator", "fake", "o"),
+        (right, "loss_d", "discriminator", "estimate", "s"),
     )
-    left.plot(
-        history["step"],
-        history["held_out_l1"],
-        color=COLOURS["real"],
-        marker="s",
-        markersize=3,
-        label="held out",
-    )
+    for ax, column, label, colour, marker in lines:
+        look = {"color": COLOURS[colour], "marker": marker, "markersize": 3, "label": label}
+        ax.plot(history["step"], history[column], **look)
     left.axhline(empty_l1, color=COLOURS["map"], linestyle="--", label="an empty image")
-    left.set(title="L1 distance (Eq. 4)", xlabel="step", ylabel="mean absolute difference", yscale="log")
-    right.plot(
-        history["step"],
-        history["loss_gan"],
-        color=COLOURS["fake"],
-        marker="o",
-        markersize=3,
-        label="generator",
-    )
-    right.plot(
-        history["step"],
-        history["loss_d"],
-        color=COLOURS["estimate"],
-        marker="s",
-        markersize=3,
-        label="discriminator",
-    )
     right.axhline(np.log(2.0), color=COLOURS["map"], linestyle="--", label="D undecided")
+    left.set(title="L1 distance (Eq. 4)", xlabel="step", ylabel="mean absolute difference", yscale="log")
+    left.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    left.yaxis.set_major_formatter("{x:g}")
+    left.yaxis.set_minor_formatter("")
     right.set(title="adversarial losses (Eq. 3)", xlabel="step", ylabel="cross-entropy", ylim=(0.0, None))
     for ax in axes:
         ax.legend(loc="best")
@@ -657,7 +643,7 @@ def draw_speeds(ax: Axes, drives: Sequence[tuple[np.ndarray, np.ndarray]], names
         ax.fill_between(times, base, base + speeds, color=colour, alpha=0.85, linewidth=0)
         ax.text(0.0, base + 9.9, names[index], fontsize=9.5)
     ax.set(
-        title="speed; a strip is 12 m/s high",
+        title="speed (strips of 12 m/s)",
         xlabel="time since the first scan [s]",
         ylim=(-12.0 * len(drives) + 11.0, 12.5),
     )

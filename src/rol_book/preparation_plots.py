@@ -55,7 +55,7 @@ def draw_timeline(
             place = names.index(lidar) + 1.0
             ax.barh(place, max(last - first, 1.0), 0.5, left=first, color=colour, label=label)
             label = "_"
-    ax.axvline((start + end) / 2, color="#444444", linewidth=0.9, linestyle="--")
+    ax.vlines((start + end) / 2, -0.5, len(names) + 0.4, color="#444444", linewidth=0.9, linestyle="--")
     ax.set_yticks(range(len(names) + 1), ["radar scan", *(f"{name} lidar" for name in names)])
     ax.set(xlabel="time since the scan's stamp [ms]", ylim=(len(names) + 1.6, -0.6), xlim=(-75, end + 15))
     ax.grid(False, axis="y")

@@ -24,7 +24,7 @@ AXIS_COLOURS = {"x": plots.COLOURS["estimate"], "y": plots.COLOURS["fake"]}
 def draw_turn(
     ax: Axes, row_poses: np.ndarray, azimuths: np.ndarray, seconds: np.ndarray, *, range_m: float = 6.0
 ) -> LineCollection:
-    """Draw the beams of one turn from above, coloured by time: x up, y to the left.
+    """Draw the beams of one turn from above, coloured by time, with a colour bar: x up, y to the left.
 
     The ends of the beams, all at one range, lie on a spiral; a dashed circle shows where they would lie with
     a stationary vehicle.
@@ -45,7 +45,7 @@ def draw_turn(
     Returns
     -------
     beams : LineCollection
-        The beams, for a colour bar of the time [ms].
+        The beams.
     """
     ends = range_m * np.stack([np.cos(azimuths), np.sin(azimuths)], axis=1)
     tips = np.array([transform_points(pose, end[None])[0] for pose, end in zip(row_poses, ends, strict=True)])
@@ -61,11 +61,12 @@ def draw_turn(
     ax.set_aspect("equal")
     ax.invert_xaxis()
     ax.set(title="beams of one turn", xlabel="y, to the left [m]", ylabel="x, forward [m]")
+    ax.figure.colorbar(beams, ax=ax, label="time from mid-scan [ms]", shrink=0.85)
     return beams
 
 
 def draw_displacement(ax: Axes, row_poses: np.ndarray, azimuths: np.ndarray) -> Axes:
-    """Draw where the radar is at each azimuth, forward and to the left of its place at mid-scan.
+    """Draw the position of the radar at each azimuth, forward and to the left of that at mid-scan.
 
     Parameters
     ----------
@@ -86,7 +87,7 @@ def draw_displacement(ax: Axes, row_poses: np.ndarray, azimuths: np.ndarray) -> 
         ax.plot(clockwise, row_poses[:, column], color=AXIS_COLOURS[colour], label=label)
     ax.axhline(0.0, color="#444444", linewidth=0.8)
     ax.set_xticks(np.arange(0, 361, 90), ["0\nahead", "90\nright", "180\nbehind", "270\nleft", "360\nahead"])
-    ax.set(title="place of the radar at each azimuth", xlabel="azimuth, clockwise [deg]")
+    ax.set(title="position of the radar at each azimuth", xlabel="azimuth, clockwise [deg]")
     ax.set_ylabel("from mid-scan [m]")
     ax.legend(loc="upper left")
     return ax
@@ -148,7 +149,10 @@ def draw_map_frames(ax: Axes, path: np.ndarray, pose: np.ndarray) -> Axes:
     look = {"arrowstyle": "-|>", "linestyle": "--", "color": "#444444", "linewidth": 1.0}
     ax.annotate("", xy=(pose[1], pose[0]), xytext=(0.0, 0.0), arrowprops=look)
     middle = 0.5 * pose[1], 0.5 * pose[0]
-    ax.annotate("T_map_radar", middle, xytext=(6, 0), textcoords="offset points", va="center")
+    box = {"boxstyle": "square,pad=0.1", "facecolor": "white", "edgecolor": "none"}
+    ax.annotate(
+        "T_map_radar", middle, xytext=(-6, -8), textcoords="offset points", ha="right", va="center", bbox=box
+    )
     draw_frame(ax, np.zeros(3), "map", length=length, place="below")
     draw_frame(ax, pose, "radar", length=length)
     ax.set_title("map and radar")
