@@ -250,12 +250,6 @@ def speed_of(stamps_us: np.ndarray, poses: np.ndarray) -> np.ndarray:
     return np.hypot(*np.gradient(poses[:, :2], seconds, axis=0).T)
 
 
-def mean_over_seeds(seeds: pd.DataFrame, column: str, scale: float = 1.0, digits: int = 2) -> str:
-    """Format the mean and standard deviation of a metric over seeds, such as "4.06 ± 0.69"."""
-    values = scale * seeds[column]
-    return f"{values.mean():.{digits}f} ± {values.std(ddof=0):.{digits}f}"
-
-
 def errors_by_motion(steps: pd.DataFrame, turning_degps: float = 3.0) -> pd.DataFrame:
     """Compute the errors of slow and fast scans, and of straight segments and turns.
 

@@ -17,7 +17,6 @@ from rol_study.localization import (
     compare_with_registration,
     errors_by_motion,
     heading_bias_deg,
-    mean_over_seeds,
     read_clouds,
     read_run,
     speed_of,
@@ -117,12 +116,6 @@ def test_run_is_read_as_it_was_written(
 
 def test_speed_is_that_of_the_path() -> None:
     np.testing.assert_allclose(speed_of(STAMPS_US, TRUTH), 8.0, rtol=0.01)
-
-
-def test_mean_and_deviation_over_seeds_are_one_text() -> None:
-    seeds = pd.DataFrame({"rmse_m": [3.37, 4.75]})
-    assert mean_over_seeds(seeds, "rmse_m") == "4.06 ± 0.69"
-    assert mean_over_seeds(seeds, "rmse_m", 100.0, digits=0) == "406 ± 69"
 
 
 def test_errors_are_split_by_speed_and_by_yaw_rate() -> None:
