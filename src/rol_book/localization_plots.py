@@ -8,12 +8,12 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 import numpy as np
+import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from rol.evaluation import CLASSES, PoseErrors
 from rol.geometry import transform_points
-from rol.mcl import MclUpdate
 from rol_book import plots
 from rol_book.plots import COLOURS, METHOD_COLOURS
 
@@ -22,7 +22,7 @@ FAILURE_LINE = {"color": "#444444", "linewidth": 1.2, "linestyle": "--"}
 
 
 def draw_scan_on_map(
-    map_points: np.ndarray, truth: np.ndarray, index: int, cloud: np.ndarray, colour: str, half: float = 40.0
+    map_points: np.ndarray, truth: np.ndarray, index: int, cloud: np.ndarray, colour: str
 ) -> Figure:
     """Draw the map with a path, and the points of one scan at its true pose.
 
@@ -38,23 +38,17 @@ def draw_scan_on_map(
         Its points in the radar frame [m].
     colour : str
         Colour of the points.
-    half : float
-        Half the edge of the enlarged square [m].
 
     Returns
     -------
     figure : Figure
     """
     figure, axes = plots.subplots(1, 2, height=4.6)
-    pose = truth[index]
-    for ax, size in zip(axes, (0.4, 1.5), strict=True):
-        plots.show_points(ax, map_points, colour=COLOURS["map"], size=size)
+    plots.show_points(axes[0], map_points, colour=COLOURS["map"], size=0.4)
     plots.draw_track(axes[0], truth, colour=COLOURS["truth"])
-    plots.frame_square(axes[0], pose[:2], half)
-    plots.show_points(axes[1], transform_points(pose, cloud), colour=colour, size=3.0)
-    plots.show_poses(axes[1], pose[None], colour=COLOURS["truth"], length=6.0)
-    plots.zoom(axes[1], pose[:2], half)
-    for ax, title in zip(axes, ("session on the map", "one scan at its true pose"), strict=True):
+    plots.frame_square(axes[0], truth[index, :2], 40.0)
+    plots.draw_scan(axes[1], map_points, truth[index], {"": cloud}, 40.0, [colour])
+    for ax, title in zip(axes, ("session on the map", "one scan at its pose"), strict=True):
         ax.set_title(title)
     return figure
 
@@ -155,9 +149,14 @@ def draw_update(
 
 
 def draw_trajectory(
-    map_points: np.ndarray, poses: np.ndarray, position_m: np.ndarray, failures: Sequence[int]
+    map_points: np.ndarray,
+    poses: np.ndarray,
+    position_m: np.ndarray,
+    failures: Sequence[int],
+    cloud: np.ndarray,
+    colour: str,
 ) -> Figure:
-    """Draw an estimated path on the map, coloured by its error, with a cross at each failure.
+    """Draw an estimated path on the map, coloured by its error, and the scan with the largest error.
 
     Parameters
     ----------
@@ -169,22 +168,25 @@ def draw_trajectory(
         Their errors [m].
     failures : sequence of int
         Scans of the failures.
+    cloud : array, shape (k, 2)
+        Points of the scan with the largest error in the radar frame [m].
+    colour : str
+        Colour of these points.
 
     Returns
     -------
     figure : Figure
     """
-    figure, ax = plots.subplots(height=5.2)
-    plots.show_points(ax, map_points, colour="#BDBDBD", size=0.5)
-    line = plots.draw_track(ax, poses, values=position_m)
-    figure.colorbar(line, ax=ax, label="position error [m]", shrink=0.8)
-    places = poses[list(failures)][:, [1, 0]].T
-    ax.plot(*places, "x", color="#000000", markersize=10, markeredgewidth=2.5)
+    figure, axes = plots.subplots(1, 2, height=5.2)
+    pose = poses[np.argmax(position_m)]
+    plots.draw_route(axes[0], map_points, poses, position_m, failures)
+    plots.frame_square(axes[0], pose[:2], 40.0, COLOURS["truth"])
+    plots.draw_scan(axes[1], map_points, pose, {"": cloud}, 40.0, [colour])
     return figure
 
 
 def draw_errors(
-    seconds: np.ndarray, errors: PoseErrors, updates: Sequence[MclUpdate], failures: Sequence[int]
+    seconds: np.ndarray, errors: PoseErrors, diagnostics: pd.DataFrame, failures: Sequence[int]
 ) -> Figure:
     """Draw the errors of a run over time, and the filter's own diagnostics.
 
@@ -194,8 +196,8 @@ def draw_errors(
         Times of the scans [s].
     errors : PoseErrors
         Errors of the n estimates.
-    updates : sequence of MclUpdate
-        Diagnostics of the n updates.
+    diagnostics : DataFrame
+        ``spread_m`` and ``inlier_ratio`` of the n updates.
     failures : sequence of int
         Scans of the failures, drawn as vertical lines.
 
@@ -207,7 +209,7 @@ def draw_errors(
     axes[0].plot(seconds, errors.longitudinal_m, color=COLOURS["estimate"], label="longitudinal")
     axes[0].plot(seconds, errors.lateral_m, color=COLOURS["real"], label="lateral")
     axes[1].plot(seconds, np.rad2deg(errors.yaw_rad), color=COLOURS["truth"])
-    spreads, ratios = [u.spread_m for u in updates], [u.inlier_ratio for u in updates]
+    spreads, ratios = diagnostics.spread_m, diagnostics.inlier_ratio
     axes[2].plot(seconds, spreads, color=COLOURS["radar"], label="spread of the particles [m]")
     axes[2].plot(seconds, ratios, color=COLOURS["fake"], label="inlier ratio")
     for ax, label in zip(axes, ("position error [m]", "heading error [deg]", "diagnostics"), strict=True):

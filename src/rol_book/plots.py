@@ -17,6 +17,8 @@ from matplotlib.figure import Figure
 from matplotlib.quiver import Quiver
 from matplotlib.ticker import LogLocator
 
+from rol.geometry import transform_points
+
 # Distinct for colour-blind readers, and by lightness on grey paper (Okabe and Ito 2008).
 COLOURS = {
     "radar": "#E69F00",
@@ -448,6 +450,82 @@ def show_poses(
     )
 
 
+def draw_scan(
+    ax: Axes,
+    map_points: np.ndarray,
+    pose: np.ndarray,
+    clouds: Mapping[str, np.ndarray],
+    half: float,
+    colours: Sequence[str] = (COLOURS["fake"], COLOURS["estimate"]),
+) -> Axes:
+    """Draw the points of one scan on the map at its pose, and the pose as an arrow.
+
+    Parameters
+    ----------
+    ax : Axes
+        Where to draw.
+    map_points : array, shape (m, 2)
+        Map [m].
+    pose : array, shape (3,)
+        Pose T_map_radar of the scan [m, m, rad].
+    clouds : mapping of str to array, shape (k, 2)
+        Kinds of its points in the radar frame [m]; several have a legend.
+    half : float
+        Half the edge of the square shown [m].
+    colours : sequence of str
+        Colours of the kinds.
+
+    Returns
+    -------
+    ax : Axes
+        The axes.
+    """
+    around = map_points[np.abs(map_points - pose[:2]).max(axis=1) < 1.2 * half]
+    show_points(ax, around, colour=COLOURS["map"], size=1.0)
+    for (label, cloud), colour in zip(clouds.items(), colours, strict=False):
+        show_points(ax, transform_points(pose, cloud), colour=colour, size=4.0, label=label)
+    show_poses(ax, pose[None], colour=COLOURS["truth"], length=half / 7.0)
+    if len(clouds) > 1:
+        ax.legend(loc="upper right", markerscale=2.5, frameon=True)
+    return zoom(ax, pose[:2], half)
+
+
+def draw_route(
+    ax: Axes,
+    map_points: np.ndarray,
+    poses: np.ndarray,
+    off_m: np.ndarray,
+    failures: Sequence[int],
+    vmax: float | None = None,
+) -> Axes:
+    """Draw an estimated path on the map, coloured by its error, with a cross at each failure.
+
+    Parameters
+    ----------
+    ax : Axes
+        Where to draw.
+    map_points : array, shape (m, 2)
+        Map [m].
+    poses, off_m : array, shape (n, 3) and (n,)
+        Estimates [m, m, rad] and position errors [m].
+    failures : sequence of int
+        Scans at which the run failed.
+    vmax : float, optional
+        Error of the brightest colour, which larger ones have too [m]; the largest error if not given.
+
+    Returns
+    -------
+    ax : Axes
+        The axes.
+    """
+    show_points(ax, map_points, colour="#C8C8C8", size=0.2)
+    line = draw_track(ax, poses, values=off_m, vmax=vmax)
+    ax.plot(*poses[list(failures)][:, [1, 0]].T, "kx", markersize=9, markeredgewidth=2)
+    look = {"location": "bottom", "extend": "max" if vmax else "neither", "shrink": 0.8}
+    ax.figure.colorbar(line, ax=ax, label="position error [m]", **look)
+    return ax
+
+
 # ---- the network ----
 
 
@@ -556,35 +634,6 @@ def draw_distances(ax: Axes, counts: np.ndarray, edges: np.ndarray, *, text: str
         ax.axvline(level, color="#444444", linewidth=0.9, linestyle="--")
     ax.text(0.97, 0.95, text, transform=ax.transAxes, ha="right", va="top", fontsize=9.5)
     ax.set(xlim=(edges[0], edges[-1]), xlabel="distance to the nearest real point [m]", ylabel="points [%]")
-    return ax
-
-
-def draw_dots(ax: Axes, values: Sequence[np.ndarray], names: Sequence[str], *, colour: str) -> Axes:
-    """Draw one column of dots per name, with a bar at the mean.
-
-    Parameters
-    ----------
-    ax : Axes
-        Where to draw.
-    values : sequence of arrays, shape (n,)
-        Values of each column; nan is left out.
-    names : sequence of str
-        Names under the columns.
-    colour : str
-        Colour of the dots.
-
-    Returns
-    -------
-    ax : Axes
-        The axes.
-    """
-    for place, column in enumerate(values):
-        aside = 0.6 * ((np.arange(len(column)) * 0.618) % 1.0 - 0.5)  # spread sideways, always the same
-        ax.scatter(place + aside, column, s=7, color=colour, alpha=0.4, linewidths=0)
-        if np.isfinite(column).any():
-            ax.hlines(np.nanmean(column), place - 0.35, place + 0.35, color="black", linewidth=2.0)
-    ax.set_xticks(range(len(names)), names)
-    ax.grid(False, axis="x")
     return ax
 
 

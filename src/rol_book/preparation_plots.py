@@ -295,39 +295,6 @@ def draw_split(ax: Axes, path: np.ndarray, parts: Mapping[str, np.ndarray]) -> A
 # ---- ground truth ----
 
 
-def draw_map_with_scan(
-    ax: Axes, map_points: np.ndarray, poses: np.ndarray, pose: np.ndarray, cloud: np.ndarray
-) -> Axes:
-    """Draw a map, the path of its session, and the points of one scan at its pose.
-
-    Parameters
-    ----------
-    ax : Axes
-        Where to draw.
-    map_points : array, shape (m, 2)
-        The map [m].
-    poses : array, shape (n, 3)
-        Poses along the path [m, m, rad].
-    pose : array, shape (3,)
-        Pose of the scan.
-    cloud : array, shape (k, 2)
-        Points of the scan in its own frame [m].
-
-    Returns
-    -------
-    ax : Axes
-        The axes.
-    """
-    plots.show_points(ax, map_points, colour=COLOURS["map"], size=0.7, label="map")
-    placed = transform_points(pose, cloud)
-    plots.show_points(ax, placed, colour=COLOURS["real"], size=1.4, label="one scan")
-    plots.draw_track(ax, poses, colour=COLOURS["truth"], label="path")
-    plots.show_poses(ax, pose[None], colour=COLOURS["truth"], length=9.0)
-    ax.set_aspect("equal", adjustable="datalim")
-    ax.legend(loc="upper right", markerscale=5)
-    return ax
-
-
 def draw_registration(
     axes: np.ndarray, maps: Mapping[str, np.ndarray], poses: Mapping[str, np.ndarray], corner: np.ndarray
 ) -> np.ndarray:

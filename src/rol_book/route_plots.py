@@ -36,67 +36,6 @@ def split_figure(n: int, height: float) -> tuple[Figure, list[Axes]]:
     return figure, [part.subplots() for part in figure.subfigures(1, n, squeeze=False)[0]]
 
 
-def draw_route(
-    ax: Axes, map_points: np.ndarray, poses: np.ndarray, off_m: np.ndarray, failures: Sequence[int]
-) -> Axes:
-    """Draw the estimated path on the map, coloured by its error, with a colour bar and the failures.
-
-    Parameters
-    ----------
-    ax : Axes
-        Where to draw.
-    map_points : array, shape (m, 2)
-        The map [m].
-    poses, off_m : array, shape (n, 3) and (n,)
-        Estimates [m, m, rad] and position errors [m]; errors of 1 m and more have the brightest colour.
-    failures : sequence of int
-        Scans at which the run failed, drawn as crosses.
-
-    Returns
-    -------
-    ax : Axes
-    """
-    plots.show_points(ax, map_points[::6], colour="#D0D0D0", size=0.1)
-    line = plots.draw_track(ax, poses, values=np.minimum(off_m, 1.0), vmax=1.0)
-    ax.plot(*poses[list(failures)][:, [1, 0]].T, "kx", markersize=9, markeredgewidth=2)
-    ax.figure.colorbar(line, ax=ax, shrink=0.8, location="bottom", label="position error [m]", extend="max")
-    return ax
-
-
-def draw_sampled_scan(
-    ax: Axes, map_points: np.ndarray, pose: np.ndarray, cloud: np.ndarray, is_near: np.ndarray
-) -> Axes:
-    """Draw the sampled points of one scan on the map at its true pose.
-
-    Parameters
-    ----------
-    ax : Axes
-        Where to draw.
-    map_points : array, shape (m, 2)
-        The map [m].
-    pose : array, shape (3,)
-        True pose T_map_radar [m, m, rad].
-    cloud : array, shape (k, 2)
-        Points in the radar frame [m].
-    is_near : array of bool, shape (k,)
-        Points within 1 m of the map.
-
-    Returns
-    -------
-    ax : Axes
-    """
-    around = map_points[np.abs(map_points - pose[:2]).max(axis=1) < 70.0]
-    placed = transform_points(pose, cloud)
-    plots.show_points(ax, around, colour=plots.COLOURS["map"], size=0.6)
-    near, far = plots.COLOURS["fake"], plots.COLOURS["estimate"]
-    plots.show_points(ax, placed[is_near], colour=near, size=4.0, label="within 1 m of the map")
-    plots.show_points(ax, placed[~is_near], colour=far, size=4.0, label="farther")
-    plots.show_poses(ax, pose[None], colour=plots.COLOURS["truth"], length=8.0)
-    plots.zoom(ax, pose[:2], 60.0)
-    ax.legend(loc="upper right", markerscale=2.5, frameon=True)
-    return ax
-
-
 def draw_quality(
     runs: pd.DataFrame, printed: Mapping[str, np.ndarray], likely: tuple[float, float]
 ) -> Figure:

@@ -37,6 +37,7 @@ def draw_speedup(ax: Axes, table: pd.DataFrame, *, period_ms: float) -> Axes:
     ax.axvline(period_ms, color="#444444", linestyle="--", linewidth=1.0, label="between two scans")
     ax.set_yticks(places, table.index)
     ax.set(xscale="log", xlabel="time [ms]")
+    ax.xaxis.set_major_formatter("{x:,g}")
     ax.legend(loc="lower right")
     return ax
 
@@ -67,6 +68,7 @@ def draw_filter_cost(axes: Sequence[Axes], costs: pd.DataFrame) -> Sequence[Axes
                 ax.plot(sizes, times, "o-", label=case.strip(", "), **look)
         ax.set(xscale="log", yscale="log", xlabel=label, ylim=(0.2, 60.0))
         ax.set_yticks([0.3, 1, 3, 10, 30], ["0.3", "1", "3", "10", "30"])
+        ax.xaxis.set_major_formatter("{x:,g}")
         ax.minorticks_off()
     axes[0].set_ylabel("processor time [ms]")
     axes[2].set_xticks([0.125, 0.25, 0.5], ["0.125", "0.25", "0.5"])

@@ -25,7 +25,7 @@ import numpy as np
 from rol.evaluation import FailureMonitor, FailureRule
 from rol.files import read_marker, write_bytes, write_text
 from rol.geometry import compose
-from rol.mcl import ParticleFilter, localize
+from rol.mcl import ParticleFilter
 from rol.odometry import fit_rigid, scan_to_scan_icp, stack_increments
 from rol.oxford import compose_odometry, load_radar, load_radar_odometry, open_session
 from rol.pairs import usable_stamps
@@ -41,6 +41,7 @@ from rol_beyond.recovery import (
 )
 from rol_beyond.robust import settings_for
 from rol_data.rall import image_to_scan, load_radar_images, load_scans
+from rol_study.filter_runs import FilterRun, run_filter
 from rol_study.oxford_route import SCAN_US
 
 CELL_M = 0.25  # of the filters' grids: the pixel of the real map
@@ -319,65 +320,6 @@ def _tell(items: Iterable, what: str, n: int, report: Report, every: int = 500) 
             report(f"{what}: {k} of {n}")
 
 
-@dataclass(frozen=True)
-class Run:
-    """Estimates of one method.
-
-    Attributes
-    ----------
-    poses : array, shape (n, 3)
-        Estimates T_map_radar [m, m, rad].
-    is_lost : array of bool, shape (n,)
-        The filter reported that it was lost; never with the method `paper`.
-    update_ms : array, shape (n,)
-        Time of each update [ms].
-    failures : list of int
-        Scans at which the run failed.
-    """
-
-    poses: np.ndarray
-    is_lost: np.ndarray
-    update_ms: np.ndarray
-    failures: list[int]
-
-
-def follow(
-    particle_filter: ParticleFilter | RecoveringFilter,
-    increments: Iterable[np.ndarray],
-    clouds: Sequence[np.ndarray],
-    monitor: FailureMonitor | None = None,
-    report: Report = lambda line: None,
-) -> Run:
-    """Run a filter over a session.
-
-    Parameters
-    ----------
-    particle_filter : ParticleFilter or RecoveringFilter
-        At its start.
-    increments : iterable of array, shape (3,)
-        Odometry [m, m, rad].
-    clouds : sequence of array, shape (m, 2)
-        Points of each scan [m].
-    monitor : FailureMonitor, optional
-        Resets the filter to the ground truth after each failure.
-    report : callable
-        Takes a line of text.
-
-    Returns
-    -------
-    run : Run
-    """
-    poses, is_lost, times, begin = [], [], [], perf_counter()
-    updates = localize(particle_filter, increments, clouds, monitor)
-    for update in _tell(updates, type(particle_filter).__name__, len(clouds), report):
-        times.append(1000.0 * (perf_counter() - begin))
-        poses.append(update.pose)
-        is_lost.append(getattr(update, "is_lost", False))
-        begin = perf_counter()
-    failures = monitor.failures if monitor else []
-    return Run(np.array(poses), np.array(is_lost), np.array(times), failures)
-
-
 def run_paper(
     session: RadarSession,
     odometry: Odometry,
@@ -385,7 +327,7 @@ def run_paper(
     map_points: np.ndarray,
     seed: int,
     report: Report = lambda line: None,
-) -> Run:
+) -> FilterRun:
     """Run the paper's filter from the true start, with a reset to the ground truth after each failure.
 
     Parameters
@@ -405,14 +347,15 @@ def run_paper(
 
     Returns
     -------
-    run : Run
+    run : FilterRun
         Yin et al. 2020, Sec. III-B and IV-C.
     """
     settings, rng = settings_for("paper", cell_m=CELL_M), np.random.default_rng([seed, 1])
     grid = settings.measurement.build_grid(map_points)
     monitor = FailureMonitor(session.stamps_us, session.truth, FailureRule())
     particle_filter = ParticleFilter(grid, session.truth[0], settings, rng)
-    return follow(particle_filter, odometry.scan_to_scan, clouds, monitor, report)
+    points = _tell(clouds, "filter of the method paper", len(clouds), report)
+    return run_filter(particle_filter, odometry.scan_to_scan, points, monitor)
 
 
 def run_robust(
@@ -423,7 +366,7 @@ def run_robust(
     seed: int,
     reference_contrast: float,
     report: Report = lambda line: None,
-) -> Run:
+) -> FilterRun:
     """Run the robust filter without resets; without ground truth it starts anywhere on the map.
 
     Parameters
@@ -437,8 +380,8 @@ def run_robust(
 
     Returns
     -------
-    run : Run
-        ``failures`` is empty, see `find_failures`. The motion model is not calibrated:
+    run : FilterRun
+        ``failures`` is empty, see `rol_study.filter_runs.find_failures`. The motion model is not calibrated:
         `rol_beyond.motion.MotionModel` with its wide noise.
     """
     settings, rng = settings_for("robust", motion=MotionModel()), np.random.default_rng([seed, 2])
@@ -450,21 +393,10 @@ def run_robust(
         reference_contrast, relocalization=RelocalizationSettings() if is_known else reach
     )
     robust_filter = RecoveringFilter(map_points, start, settings, recovery, rng, is_known)
-    even = _Evened(clouds, np.random.default_rng([seed, 3]))
-    return follow(robust_filter, gate_odometry(odometry.local_map), even, report=report)
-
-
-class _Evened(Sequence):
-    """Clouds resampled by density."""
-
-    def __init__(self, clouds: Sequence[np.ndarray], rng: np.random.Generator) -> None:
-        self.clouds, self.rng = clouds, rng
-
-    def __len__(self) -> int:
-        return len(self.clouds)
-
-    def __getitem__(self, index: int) -> np.ndarray:
-        return resample_by_density(self.clouds[index], EVEN_M, self.rng)
+    even_rng = np.random.default_rng([seed, 3])
+    even = (resample_by_density(cloud, EVEN_M, even_rng) for cloud in clouds)
+    points = _tell(even, "filter of the method robust", len(clouds), report)
+    return run_filter(robust_filter, gate_odometry(odometry.local_map), points)
 
 
 def measure_contrast(real_root: Path | str, network: TrainedNetwork, map_points: np.ndarray) -> float:
@@ -490,12 +422,12 @@ def measure_contrast(real_root: Path | str, network: TrainedNetwork, map_points:
     return measure_reference_contrast((resample_by_density(p, EVEN_M, rng) for p in points), poses, grid)
 
 
-def find_start(run: Run) -> int:
+def find_start(run: FilterRun) -> int:
     """Find the scan from which the estimate counts: after it the filter was not lost for two seconds.
 
     Parameters
     ----------
-    run : Run
+    run : FilterRun
         Of the robust filter.
 
     Returns
@@ -519,14 +451,14 @@ def find_start(run: Run) -> int:
     return int(np.argmax(found)) + N_FOUND - 1
 
 
-def fit_official(official: np.ndarray, run: Run, first: int, fraction: float = 0.8) -> np.ndarray:
+def fit_official(official: np.ndarray, run: FilterRun, first: int, fraction: float = 0.8) -> np.ndarray:
     """Fit the official trajectory rigidly to the estimate.
 
     Parameters
     ----------
     official : array, shape (n, 3)
         Trajectory in any frame [m, m, rad].
-    run : Run
+    run : FilterRun
         Estimates.
     first : int
         First scan that counts.
@@ -549,14 +481,6 @@ def fit_official(official: np.ndarray, run: Run, first: int, fraction: float = 0
     return compose(fit_rigid(source[chosen, :2], target[chosen]), official)
 
 
-def with_fitted_truth(session: RadarSession, run: Run, first: int) -> RadarSession:
+def with_fitted_truth(session: RadarSession, run: FilterRun, first: int) -> RadarSession:
     """Give a session whose ground truth is its official trajectory, fitted by `fit_official`."""
     return replace(session, truth=fit_official(session.official, run, first))
-
-
-def find_failures(stamps_us: np.ndarray, poses: np.ndarray, truth: np.ndarray) -> list[int]:
-    """Find the failures of a run without resets; one that lasts counts each time the rule is fulfilled."""
-    monitor = FailureMonitor(stamps_us, truth, FailureRule())
-    for index, pose in enumerate(poses):
-        monitor(index, pose)
-    return monitor.failures

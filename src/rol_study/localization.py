@@ -1,15 +1,10 @@
-"""Localization runs on one session: clouds of each kind, the filter, and registration without a filter.
-
-The clouds come from the results of chapters 02 to 05. A run keeps the estimates, diagnostics and times of all
-scans, but not the particles, so that its memory stays small on a long session.
-"""
+"""Localization runs on one session: clouds of each kind from chapters 02 to 05, and the files of a run."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, MutableSequence, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from time import perf_counter
 
 import numpy as np
 import pandas as pd
@@ -21,16 +16,15 @@ from rol.evaluation import (
     pose_errors,
     read_metrics,
     read_tum,
-    summarize,
     write_metrics,
     write_tum,
 )
 from rol.files import write_text
-from rol.mcl import MclUpdate, ParticleFilter, localize
+from rol.mcl import ParticleFilter
 from rol.oxford import load_radar, open_session
 from rol.pairs import read_image, read_points
 from rol_beyond.front_ends import detect_points
-from rol_beyond.scan_matching import scan_to_map_icp
+from rol_study.filter_runs import FilterRun, run_filter, run_registration
 
 POINT_SOURCES = {  # name -> label; "corrected": at mid-scan
     "raw": "raw radar peaks",
@@ -41,15 +35,7 @@ POINT_SOURCES = {  # name -> label; "corrected": at mid-scan
     "real-corrected": "lidar points, compensated",
 }
 FAST_MPS = 4.0  # speed above which `heading_bias_deg` counts a scan [m/s]
-DIAGNOSTICS = {  # column of steps.csv -> field of MclUpdate
-    "ess": "ess",
-    "spread_m": "spread_m",
-    "spread_yaw_rad": "spread_yaw_rad",
-    "match_share": "inlier_ratio",
-    "n_points": "n_points",
-    "is_informed": "measurement_used",
-}
-_WITHOUT_PARTICLES = dict.fromkeys(("particles", "weights", "next_particles", "next_weights"))
+COLUMNS = {"inlier_ratio": "match_share", "measurement_used": "is_informed"}  # diagnostics in steps.csv
 
 
 def read_clouds(
@@ -100,107 +86,6 @@ def read_clouds(
     return (image_to_points(read_image(images / f"{us}.png")) for us in stamps)
 
 
-@dataclass(frozen=True)
-class FilterRun:
-    """One run over a session.
-
-    Attributes
-    ----------
-    poses : array, shape (n, 3)
-        Estimates T_map_radar [m, m, rad].
-    failures : list of int
-        Scans after which the run was reset.
-    updates : list of MclUpdate
-        Diagnostics of each scan, without particles; none for a run without a filter.
-    times_ms : list of float
-        Time of each scan [ms].
-    """
-
-    poses: np.ndarray
-    failures: list[int]
-    updates: list[MclUpdate]
-    times_ms: list[float]
-
-    def summarize(self, truth: np.ndarray, method: str, session: str, seed: int) -> dict:
-        """Compute the metrics of the run by `rol.evaluation.summarize`."""
-        median_ms = float(np.median(self.times_ms))
-        names = {"method": method, "session": session, "seed": seed, "failures": len(self.failures)}
-        return summarize(self.poses, truth, update_ms_median=median_ms, **names)
-
-
-def run_filter(
-    particle_filter: ParticleFilter,
-    increments: Iterable[np.ndarray],
-    clouds: Iterable[np.ndarray],
-    monitor: FailureMonitor,
-    particles: MutableSequence | None = None,
-) -> FilterRun:
-    """Run a filter over the scans of a session; after a failure it is reset to the ground truth.
-
-    Parameters
-    ----------
-    particle_filter : ParticleFilter
-        Filter at the first pose.
-    increments : iterable of array, shape (3,)
-        Odometry between successive scans [m, m, rad].
-    clouds : iterable of array, shape (m, 2)
-        Points of each scan in the radar frame [m].
-    monitor : FailureMonitor
-        Records failures and resets the filter.
-    particles : mutable sequence, optional
-        The particles of each scan are appended to it, such as a `rol.array_file.ArrayFile`.
-
-    Returns
-    -------
-    run : FilterRun
-    """
-    updates, times_ms = [], []
-    begin = perf_counter()
-    for update in localize(particle_filter, increments, clouds, monitor):
-        times_ms.append(1000.0 * (perf_counter() - begin))
-        updates.append(replace(update, **_WITHOUT_PARTICLES))
-        if particles is not None:
-            particles.append(update.particles)
-        begin = perf_counter()
-    poses = np.array([update.pose for update in updates])
-    return FilterRun(poses, monitor.failures, updates, times_ms)
-
-
-def run_registration(
-    increments: Iterable[np.ndarray],
-    clouds: Iterable[np.ndarray],
-    map_points: np.ndarray,
-    start: np.ndarray,
-    monitor: FailureMonitor,
-) -> FilterRun:
-    """Register each cloud to the map by ICP, without a filter; after a failure from the ground truth.
-
-    Parameters
-    ----------
-    increments : iterable of array, shape (3,)
-        Odometry between successive scans [m, m, rad].
-    clouds : iterable of array, shape (m, 2)
-        Points of each scan in the radar frame [m].
-    map_points : array, shape (k, 2)
-        Map [m].
-    start : array, shape (3,)
-        Pose at the first scan [m, m, rad].
-    monitor : FailureMonitor
-        Records failures and resets the pose.
-
-    Returns
-    -------
-    run : FilterRun
-    """
-    poses, times_ms = [], []
-    begin = perf_counter()
-    for result in scan_to_map_icp(increments, clouds, map_points, start, monitor):
-        times_ms.append(1000.0 * (perf_counter() - begin))
-        poses.append(result.T_target_source)
-        begin = perf_counter()
-    return FilterRun(np.array(poses), monitor.failures, [], times_ms)
-
-
 def compare_with_registration(
     clouds: Sequence[np.ndarray],
     increments: np.ndarray,
@@ -238,9 +123,7 @@ def compare_with_registration(
     seeds = list(seeds)
     for seed in seeds:
         yield "filter", seed, run_filter(new_filter(seed), increments, clouds, new_monitor())
-    monitor = new_monitor()
-    registered = run_registration(increments, clouds, map_points, monitor.truth[0], monitor)
-    yield "ICP on the map", seeds[0], registered
+    yield "ICP on the map", seeds[0], run_registration(increments, clouds, map_points, new_monitor())
 
 
 def heading_bias_deg(poses: np.ndarray, truth: np.ndarray, speed_mps: np.ndarray) -> float:
@@ -282,11 +165,10 @@ def write_run(
     """
     folder, errors = Path(folder), pose_errors(run.poses, truth)
     steps = pd.DataFrame({"radar_stamp_us": stamps_us, "speed_mps": speed_of(stamps_us, truth)})
-    steps["update_ms"] = run.times_ms
+    steps["update_ms"] = run.update_ms
     for name in ("position_m", "longitudinal_m", "lateral_m", "yaw_rad"):
         steps[name] = getattr(errors, name)
-    for name, field in DIAGNOSTICS.items():
-        steps[name] = [getattr(update, field) for update in run.updates]
+    steps = steps.join(run.diagnostics.rename(columns=COLUMNS))
     steps["is_restarted"] = np.isin(np.arange(len(steps)), run.failures)
     write_tum(folder / "trajectory.tum", stamps_us, run.poses)
     write_tum(folder / "truth.tum", stamps_us, truth)
@@ -366,12 +248,6 @@ def speed_of(stamps_us: np.ndarray, poses: np.ndarray) -> np.ndarray:
     """
     seconds = (stamps_us - stamps_us[0]) / 1e6
     return np.hypot(*np.gradient(poses[:, :2], seconds, axis=0).T)
-
-
-def mean_over_seeds(seeds: pd.DataFrame, column: str, scale: float = 1.0, digits: int = 2) -> str:
-    """Format the mean and standard deviation of a metric over seeds, such as "4.06 ± 0.69"."""
-    values = scale * seeds[column]
-    return f"{values.mean():.{digits}f} ± {values.std(ddof=0):.{digits}f}"
 
 
 def errors_by_motion(steps: pd.DataFrame, turning_degps: float = 3.0) -> pd.DataFrame:

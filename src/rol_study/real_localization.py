@@ -17,7 +17,7 @@ from rol.pipeline import RadarLocalizer
 from rol.pix2pix import TrainedNetwork
 from rol_beyond.front_ends import evaluate_on_map
 from rol_beyond.motion import MotionModel
-from rol_beyond.pipeline import FrontEnd, RobustLocalizer
+from rol_beyond.pipeline import RobustLocalizer
 from rol_beyond.recovery import RecoveringFilter, RecoverySettings
 from rol_beyond.robust import settings_for
 from rol_data.rall import RealScan, group_scans
@@ -27,6 +27,8 @@ FIRST_PARTICLES, MAX_PARTICLES = 40_000, 5000  # at the first scan, and later
 EVEN_M = 2.0  # radius within which points share their weight [m]
 SIGMAS = (0.1, 0.05, float(np.deg2rad(0.3)))  # of an odometry increment [m, m, rad]
 LIMITS = (0.6, 0.6)  # aimed at [m, deg]
+# Takes a scan and a twist (vx, vy, yaw rate) or None; returns points, compensated for the twist, (n, 2) [m].
+FrontEnd = Callable[[Any, tuple[float, float, float] | None], np.ndarray]
 FROM_SCAN = 4  # scan, counted from 1, from which on runs are judged
 
 
@@ -127,7 +129,7 @@ def localize_from_starts(
     scans : sequence of RealScan
         The scans, in the order of time.
     front_end : callable
-        As in `rol_beyond.pipeline.RobustLocalizer`.
+        Takes a scan and a twist or None and returns points, see `cache_front_end`.
     map_points : array, shape (m, 2)
         Points of the map [m].
     starts : array, shape (s, 3)
@@ -151,7 +153,9 @@ def localize_from_starts(
                 map_points, start, settings.filter, settings.recovery, rng, grid=grid
             )
             radius = settings.density_radius_m
-            localizer = RobustLocalizer(recovering, front_end, density_radius_m=radius)
+            localizer = RobustLocalizer(
+                recovering, lambda scan: front_end(scan, None), density_radius_m=radius
+            )
             runs.append([localizer.step(scan).pose for scan in scans])
     return np.array(runs)
 
@@ -466,7 +470,7 @@ def evaluate_turn(
     scan : RealScan
         Scan with pose and twist.
     front_ends : mapping of str to callable
-        Front ends by name, as in `rol_beyond.pipeline.RobustLocalizer`.
+        Front ends by name, see `cache_front_end`.
     variants : mapping of str to (bool, float)
         Name -> whether motion is compensated, and the angle added to the azimuths [rad].
     map_points : array, shape (m, 2)

@@ -7,7 +7,7 @@ contrast, is calibrated on another session.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from time import perf_counter
@@ -26,8 +26,8 @@ from rol_beyond.recovery import (
     measure_reference_contrast,
 )
 from rol_beyond.robust import settings_for
-from rol_beyond.scan_matching import ScanToMapSettings, scan_to_map_icp
 from rol_data.rall import load_map
+from rol_study.filter_runs import FilterRun, find_failures, run_filter, run_registration
 from rol_study.oxford_route import (
     SCAN_US,
     RouteSession,
@@ -241,139 +241,6 @@ def sample_session(experiment: RouteExperiment, seed: int) -> list[np.ndarray]:
     return list(sample_points(e.map_points, e.session.truth, e.visible, e.front_end, rng, e.parts))
 
 
-@dataclass(frozen=True)
-class FilterRun:
-    """Results of one run over a session, scan by scan.
-
-    Attributes
-    ----------
-    poses : array, shape (n, 3)
-        Estimates T_map_radar [m, m, rad].
-    covariances : array, shape (n, 3, 3)
-        Of the particles [m, m, rad].
-    failures : list of int
-        Scans at which the run failed by the rule of failures.
-    is_lost : array of bool, shape (n,)
-        The filter reported that it was lost; never with the method `paper`.
-    normalized_score : array, shape (n,)
-        See `rol_beyond.recovery.RecoveryUpdate`; NaN for the method `paper`.
-    n_particles : array of int, shape (n,)
-        Particles.
-    update_ms : array, shape (n,)
-        Time of each update [ms].
-    """
-
-    poses: np.ndarray
-    covariances: np.ndarray
-    failures: list[int]
-    is_lost: np.ndarray
-    normalized_score: np.ndarray
-    n_particles: np.ndarray
-    update_ms: np.ndarray
-
-
-def run_paper(
-    session: RouteSession,
-    clouds: Iterable[np.ndarray],
-    particle_filter: ParticleFilter,
-    rule: FailureRule | None = None,
-) -> FilterRun:
-    """Run the paper's filter, with a reset to the ground truth after each failure.
-
-    Parameters
-    ----------
-    session : RouteSession
-        The session.
-    clouds : iterable of array, shape (m, 2)
-        Points of each scan [m].
-    particle_filter : ParticleFilter
-        At the start of the session.
-    rule : FailureRule, optional
-        When a run has failed.
-
-    Returns
-    -------
-    run : FilterRun
-        Yin et al. 2020, Sec. III-B and IV-C.
-    """
-    monitor = FailureMonitor(session.stamps_us, session.truth, rule or FailureRule())
-    updates = localize(particle_filter, session.increments, clouds, monitor)
-    rows, times = _collect(updates, lambda u: (u.pose, u.covariance, False, np.nan, len(u.particles)))
-    return FilterRun(*rows[:2], monitor.failures, *rows[2:], times)
-
-
-def run_robust(
-    session: RouteSession,
-    clouds: Iterable[np.ndarray],
-    robust_filter: RecoveringFilter,
-    rule: FailureRule | None = None,
-) -> FilterRun:
-    """Run the robust filter, without resets.
-
-    Parameters
-    ----------
-    session, clouds, rule
-        As for `run_paper`; a failure that lasts counts again each time that the rule is fulfilled anew.
-    robust_filter : RecoveringFilter
-        At the start of the session.
-
-    Returns
-    -------
-    run : FilterRun
-    """
-    updates = localize(robust_filter, gate_odometry(session.increments), clouds)
-    rows, times = _collect(
-        updates, lambda u: (u.pose, u.covariance, u.is_lost, u.normalized_score, u.n_particles)
-    )
-    monitor = FailureMonitor(session.stamps_us, session.truth, rule or FailureRule())
-    for index, pose in enumerate(rows[0]):
-        monitor(index, pose)
-    return FilterRun(*rows[:2], monitor.failures, *rows[2:], times)
-
-
-def run_scan_to_map(
-    session: RouteSession,
-    clouds: Iterable[np.ndarray],
-    map_points: np.ndarray,
-    rule: FailureRule | None = None,
-    settings: ScanToMapSettings | None = None,
-) -> FilterRun:
-    """Register each scan to the map by ICP, without a filter,
-    with a reset to the ground truth after each failure.
-
-    Parameters
-    ----------
-    session, clouds, rule
-        As for `run_paper`.
-    map_points : array, shape (m, 2)
-        The map [m].
-    settings : ScanToMapSettings, optional
-        Settings of `rol_beyond.scan_matching.scan_to_map_icp`.
-
-    Returns
-    -------
-    run : FilterRun
-        ``is_lost`` marks rejected registrations; there are no covariances, no normalized score and no
-        particles (NaN, NaN and 0). Yin et al. 2020, Sec. III-B.
-    """
-    monitor = FailureMonitor(session.stamps_us, session.truth, rule or FailureRule())
-    settings, start = settings or ScanToMapSettings(), session.truth[0]
-    results = scan_to_map_icp(session.increments, clouds, map_points, start, monitor, settings)
-    nothing = np.full((3, 3), np.nan)
-    rows, times = _collect(results, lambda r: (r.T_target_source, nothing, not r.converged, np.nan, 0))
-    return FilterRun(*rows[:2], monitor.failures, *rows[2:], times)
-
-
-def _collect(updates: Iterable, read: Callable) -> tuple[list[np.ndarray], np.ndarray]:
-    """Run a filter to its end; return the values read from each update as arrays, and its time [ms]."""
-    rows, times, begin = [], [], perf_counter()
-    for update in updates:
-        times.append(1000.0 * (perf_counter() - begin))
-        rows.append(read(update))
-        begin = perf_counter()
-    return [np.array(column) for column in zip(*rows, strict=True)], np.array(times)
-
-
 def run_method(
     experiment: RouteExperiment,
     method: str,
@@ -391,7 +258,8 @@ def run_method(
     experiment : RouteExperiment
         Session, map and calibration.
     method : str
-        "paper", "robust" or "registration", see `run_paper`, `run_robust` and `run_scan_to_map`.
+        "paper" and "registration" (`run_registration`) are reset to the ground truth after each failure;
+        "robust" is never reset.
     clouds : sequence of array, shape (m, 2)
         Points of each scan [m].
     seed : int
@@ -408,16 +276,20 @@ def run_method(
     run : FilterRun
     """
     session, map_points = experiment.session, experiment.map_points
+    increments, rule = session.increments, rule or FailureRule()
+    monitor = FailureMonitor(session.stamps_us, session.truth, rule)
     if method == "registration":
-        return run_scan_to_map(session, clouds, map_points, rule)
+        return run_registration(increments, clouds, map_points, monitor)
     rng, start = np.random.default_rng([seed, int(session.number), 1]), session.truth[0]
     settings = settings_for(method, **{"cell_m": CELL_M, **changes})
     if method == "paper":
         grid = settings.measurement.build_grid(map_points)
-        return run_paper(session, clouds, ParticleFilter(grid, start, settings, rng), rule)
+        return run_filter(ParticleFilter(grid, start, settings, rng), increments, clouds, monitor)
     settings = replace(settings, motion=experiment.motion)
     recovery = recovery or RecoverySettings(experiment.reference_contrast)
-    return run_robust(session, clouds, RecoveringFilter(map_points, start, settings, recovery, rng), rule)
+    robust_filter = RecoveringFilter(map_points, start, settings, recovery, rng)
+    run = run_filter(robust_filter, gate_odometry(increments), clouds)
+    return replace(run, failures=find_failures(session.stamps_us, run.poses, session.truth, rule))
 
 
 def displace(pose: np.ndarray, distance_m: float, turn: float, rng: np.random.Generator) -> np.ndarray:

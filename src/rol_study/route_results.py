@@ -317,7 +317,7 @@ def peer_table(tuned: pd.DataFrame, registered: pd.DataFrame, runs: pd.DataFrame
         runs.assign(filter=runs.method),
         tuned.assign(filter=tuned.what.map(names)),
     ])  # fmt: skip
-    is_peer = peers.seed.isin({*tuned.seed, *registered.seed}) & peers.session.isin(tuned.session)
+    is_peer = peers.seed.isin({*tuned.seed} & {*registered.seed}) & peers.session.isin(tuned.session)
     groups = summarize_runs(peers[is_peer], ["filter"])
     return groups.sort_values("rmse_m", ascending=False, kind="stable")
 

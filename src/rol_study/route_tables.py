@@ -16,7 +16,7 @@ import numpy as np
 import pandas as pd
 import torch
 
-from rol.evaluation import METRICS, pose_errors, rmse, summarize
+from rol.evaluation import METRICS, pose_errors, rmse
 from rol.files import write_text
 from rol.mcl import MclSettings, Measurement
 from rol.pix2pix import load_network
@@ -26,10 +26,10 @@ from rol_beyond.motion import MotionModel
 from rol_beyond.recovery import DetectionSettings, RecoverySettings
 from rol_beyond.robust import settings_for
 from rol_data.rall import PLACES, POSES_PATH, load_poses
+from rol_study.filter_runs import FilterRun
 from rol_study.oxford_route import list_sessions, published_motion, published_reference_contrast
 from rol_study.rendered_points import build_segment, render_points
 from rol_study.route_experiments import (
-    FilterRun,
     RouteExperiment,
     add_outliers,
     change_front_end,
@@ -127,9 +127,7 @@ def front_end_of(fraction_1m: float, **changes: float) -> FrontEnd:
 def row_of(experiment: RouteExperiment, run: FilterRun, method: str, seed: int) -> dict:
     """Compute the metrics of one run."""
     truth, errors = experiment.session.truth, pose_errors(run.poses, experiment.session.truth)
-    about = {"method": method, "session": experiment.session.number, "seed": seed}
-    update_ms = float(np.median(run.update_ms))
-    row = summarize(run.poses, truth, failures=len(run.failures), update_ms_median=update_ms, **about)
+    row = run.summarize(truth, method, experiment.session.number, seed)
     is_faulty = experiment.session.is_faulty
     is_sound = np.ones(len(truth), dtype=bool) if is_faulty is None else ~is_faulty
     return row | {
@@ -357,7 +355,7 @@ def list_jobs(real_root: str) -> dict[str, list[tuple]]:
         "anywhere": places(50, 120),
         "ingredients": [(starts[-1], name, seed) for name in INGREDIENTS for seed in (1, 2, 3, 4, 5)],
         "tuned": list_tuned(ours),
-        "registration": [(number, seed) for seed in (1, 2) for number in ours],
+        "registration": [(number, seed) for seed in (1, 2, 3) for number in ours],
         "rendered": [key for key in (("02", 6000, 400, 1), ("07", 5050, 400, 1)) if key[0] in numbers],
     }
 

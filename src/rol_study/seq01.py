@@ -23,6 +23,7 @@ from rol_beyond.front_ends import evaluate_on_map
 from rol_data.rall import MAP_PATH, MAP_SHAPE, RallError, find_real_root, load_map_points
 from rol_study import end_to_end
 from rol_study.end_to_end import RadarSession, Report
+from rol_study.filter_runs import FilterRun, find_failures
 
 EVERY = 20  # of the points of this many scans one is compared with the map
 TABLES = {"table2_rmse.csv": "II", "table3_distribution.csv": "III"}
@@ -84,10 +85,10 @@ def run_session(
     return table
 
 
-def _write_run(folder: Path, session: RadarSession, run: end_to_end.Run, first: int, about: dict) -> dict:
+def _write_run(folder: Path, session: RadarSession, run: FilterRun, first: int, about: dict) -> dict:
     """Write trajectory, ground truth and metrics of a run from its first scan that counts."""
     stamps, truth, poses = (values[first:] for values in (session.stamps_us, session.truth, run.poses))
-    failures = len(run.failures or end_to_end.find_failures(stamps, poses, truth))
+    failures = len(run.failures or find_failures(stamps, poses, truth))
     update_ms = float(np.median(run.update_ms))
     about = about | {"session": session.name, "failures": failures, "update_ms_median": update_ms}
     metrics = summarize(poses, truth, **about)

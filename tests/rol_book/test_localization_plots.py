@@ -40,9 +40,19 @@ def test_errors_beyond_the_histogram_are_in_its_last_bin() -> None:
 
 
 def test_a_failure_is_a_cross() -> None:
-    figure = figures.draw_trajectory(np.zeros((3, 2)), ESTIMATE, ERRORS.position_m, [1])
-    (cross,) = figure.axes[0].lines
+    cloud = np.array([[1.0, 2.0]])
+    figure = figures.draw_trajectory(np.zeros((3, 2)), ESTIMATE, ERRORS.position_m, [1], cloud, "#000000")
+    cross = figure.axes[0].lines[0]
     assert (cross.get_xdata()[0], cross.get_ydata()[0]) == (1.5, 0.0)
+
+
+def test_a_scan_lies_at_its_pose_on_the_map_around_it() -> None:
+    ax, map_points = plots.subplots()[1], np.array([[0.0, 3.0], [0.0, 90.0]])
+    plots.draw_scan(ax, map_points, np.array([0.0, 3.0, np.pi / 2]), {"a": np.array([[1.0, 0.0]])}, 10.0)
+    on_map, cloud = (dots.get_offsets().tolist() for dots in ax.collections[:2])
+    assert on_map == [[3.0, 0.0]] and ax.get_legend() is None
+    np.testing.assert_allclose(cloud, [[4.0, 0.0]], atol=1e-9)
+    assert ax.get_xlim() == (13.0, -7.0)
 
 
 def test_registration_has_a_panel_for_each_pose() -> None:

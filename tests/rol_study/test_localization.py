@@ -1,5 +1,6 @@
-"""Runs of localization: reading of clouds, filter and registration, files of a run, errors by motion."""
+"""Runs of localization: reading of clouds, comparison with registration, files of a run, errors by motion."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -8,20 +9,16 @@ import pandas as pd
 import pytest
 
 from rol.bev import image_to_points, points_to_image
-from rol.evaluation import FailureMonitor, FailureRule
+from rol.evaluation import FailureMonitor
 from rol.geometry import accumulate_increments, invert, relative_pose, transform_points
 from rol.mcl import MclSettings, ParticleFilter
-from rol_study import localization
+from rol_study.filter_runs import run_filter
 from rol_study.localization import (
-    FilterRun,
     compare_with_registration,
     errors_by_motion,
     heading_bias_deg,
-    mean_over_seeds,
     read_clouds,
     read_run,
-    run_filter,
-    run_registration,
     speed_of,
     write_run,
 )
@@ -52,40 +49,6 @@ def clouds(map_points: np.ndarray) -> list[np.ndarray]:
 def new_filter(map_points: np.ndarray, seed: int = 1) -> ParticleFilter:
     grid = SETTINGS.measurement.build_grid(map_points)
     return ParticleFilter(grid, TRUTH[0], SETTINGS, np.random.default_rng(seed))
-
-
-def largest_error(poses: np.ndarray) -> float:
-    return float(np.hypot(*(poses - TRUTH)[:, :2].T).max())
-
-
-def test_filter_follows_the_path_and_keeps_no_particles(
-    map_points: np.ndarray, clouds: list[np.ndarray]
-) -> None:
-    particles: list[np.ndarray] = []
-    monitor = FailureMonitor(STAMPS_US, TRUTH)
-    run = run_filter(new_filter(map_points), INCREMENTS, clouds, monitor, particles)
-    assert largest_error(run.poses) < 0.5 and run.failures == []
-    assert len(run.times_ms) == len(particles) == N and particles[0].shape == (200, 3)
-    assert all(update.particles is None for update in run.updates)
-    metrics = run.summarize(TRUTH, "paper", "town", 4)
-    assert (metrics["n_scans"], metrics["failures"], metrics["seed"]) == (N, 0, 4)
-
-
-def test_failures_are_those_of_the_monitor(map_points: np.ndarray) -> None:
-    nothing = [np.zeros((0, 2))] * N
-    monitor = FailureMonitor(STAMPS_US, TRUTH, FailureRule(3.0, 1.0, 0.0))
-    standing = np.zeros((N - 1, 3))  # the estimate stays while the vehicle drives 2 m per scan
-    run = run_filter(new_filter(map_points), standing, nothing, monitor)
-    assert run.failures and run.failures[0] in (1, 2, 3)
-
-
-def test_registration_finds_the_path_from_wrong_odometry(
-    map_points: np.ndarray, clouds: list[np.ndarray]
-) -> None:
-    wrong = INCREMENTS + (0.3, -0.2, 0.005)
-    monitor = FailureMonitor(STAMPS_US, TRUTH)
-    run = run_registration(wrong, clouds, map_points, TRUTH[0], monitor)
-    assert largest_error(run.poses) < 0.05 and run.updates == []
 
 
 def test_every_seed_and_then_the_registration_is_run(
@@ -138,7 +101,7 @@ def test_run_is_read_as_it_was_written(
 ) -> None:
     run = run_filter(new_filter(map_points), INCREMENTS, clouds, FailureMonitor(STAMPS_US, TRUTH))
     metrics = run.summarize(TRUTH, "paper", "town", 1)
-    write_run(tmp_path, FilterRun(run.poses, [3], run.updates, run.times_ms), STAMPS_US + 1, TRUTH, metrics)
+    write_run(tmp_path, replace(run, failures=[3]), STAMPS_US + 1, TRUTH, metrics)
     for name in ("seeds", "sources"):
         pd.DataFrame([metrics]).to_csv(tmp_path / f"{name}.csv", index=False)
     stored = read_run(tmp_path)
@@ -148,17 +111,11 @@ def test_run_is_read_as_it_was_written(
     np.testing.assert_allclose(stored.steps.speed_mps, 8.0, rtol=0.01)
     np.testing.assert_allclose(stored.steps.yaw_rate_degps, np.rad2deg(0.08), atol=0.01)
     assert list(np.flatnonzero(stored.steps.is_restarted)) == [3]
-    assert list(stored.steps.match_share) == [update.inlier_ratio for update in run.updates]
+    np.testing.assert_array_equal(stored.steps.match_share, run.diagnostics.inlier_ratio)
 
 
 def test_speed_is_that_of_the_path() -> None:
     np.testing.assert_allclose(speed_of(STAMPS_US, TRUTH), 8.0, rtol=0.01)
-
-
-def test_mean_and_deviation_over_seeds_are_one_text() -> None:
-    seeds = pd.DataFrame({"rmse_m": [3.37, 4.75]})
-    assert mean_over_seeds(seeds, "rmse_m") == "4.06 ± 0.69"
-    assert mean_over_seeds(seeds, "rmse_m", 100.0, digits=0) == "406 ± 69"
 
 
 def test_errors_are_split_by_speed_and_by_yaw_rate() -> None:
@@ -179,8 +136,3 @@ def test_errors_are_split_by_speed_and_by_yaw_rate() -> None:
     assert table.rmse_yaw_deg["straight"] == pytest.approx(1.0)
     assert table.rmse_yaw_deg["turning"] == pytest.approx(3.0)
     assert table.rmse_m["all"] == pytest.approx(np.sqrt(31.25))
-
-
-def test_every_column_of_the_diagnostics_is_a_field_of_an_update() -> None:
-    fields = set(localization.MclUpdate.__dataclass_fields__)
-    assert set(localization.DIAGNOSTICS.values()) <= fields

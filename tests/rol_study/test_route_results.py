@@ -156,3 +156,8 @@ def test_trials_are_summarized() -> None:
     assert numbers == {
         "found": 25.0, "median_s": 10.5, "wrong": 1.0, "particles": 30.0, "told": 75.0, "cpu_s": 2.5, "n": 4
     }  # fmt: skip
+
+
+def test_mean_and_deviation_are_one_text() -> None:
+    values = pd.Series([3.37, 4.75])
+    assert results.spread(values) == "4.06 ± 0.69" and results.spread(values, 100.0, digits=0) == "406 ± 69"

@@ -12,8 +12,9 @@ import pytest
 from rol_beyond.motion import MotionModel
 from rol_data import rall
 from rol_study import route_tables
+from rol_study.filter_runs import FilterRun
 from rol_study.oxford_route import RouteSession, published_motion
-from rol_study.route_experiments import FilterRun, RouteExperiment
+from rol_study.route_experiments import RouteExperiment
 
 N = 30
 
@@ -47,7 +48,8 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> list[SimpleNamespace]:
             )
         )
         spread = np.full((N, 3, 3), np.nan) if method == "registration" else np.tile(np.eye(3), (N, 1, 1))
-        return FilterRun(truth, spread, [], np.zeros(N, dtype=bool), np.ones(N), np.full(N, 100), np.ones(N))
+        is_lost, n_particles, update_ms = np.zeros(N, dtype=bool), np.full(N, 100), np.ones(N)
+        return FilterRun(truth, spread, [], is_lost, n_particles, update_ms, pd.DataFrame())
 
     def prepare(real_root, number, front_end=None, max_scans=0, settings=None, odometry="rall"):
         session = replace(experiment.session, odometry=odometry)

@@ -23,7 +23,8 @@ from rol_data import rall
 from rol_sim.session import oxford_files
 from rol_sim.session.simulation import make_scan
 from rol_study import end_to_end, seq01
-from rol_study.end_to_end import EndToEndError, RadarSession, Run, keep_points, open_oxford
+from rol_study.end_to_end import EndToEndError, RadarSession, keep_points, open_oxford
+from rol_study.filter_runs import FilterRun, find_failures
 from rol_study.rendered_points import build_segment
 
 QUIET = {"vehicles": 0, "people": 0, "parked_share": 0.0}
@@ -154,7 +155,7 @@ def test_both_methods_localize_a_session_with_ground_truth(measured: RadarSessio
         assert read_metrics(folder / "metrics.json")["rmse_m"] == pytest.approx(row.rmse_m)
         stamps, poses = read_tum(folder / "trajectory.tum")
         assert len(stamps) == N and np.abs(poses - measured.truth)[:, :2].max() < 1.0
-    assert any("ParticleFilter" in line for line in lines) and any("raw points" in line for line in lines)
+    assert any("method paper" in line for line in lines) and any("raw points" in line for line in lines)
     again: list[str] = []
     pd.testing.assert_frame_equal(
         seq01.run_session(measured, NOBODY, tmp_path, tmp_path / "out", 1, again.append).drop(
@@ -179,8 +180,9 @@ def test_an_unknown_start_is_found_and_judged_by_the_official_odometry(
     assert x.max() < 0.15 and y.max() < 0.15 and yaw.max() < 0.005  # not where the first estimates were
 
 
-def run_of(poses: np.ndarray, is_lost: np.ndarray) -> Run:
-    return Run(poses, is_lost, np.zeros(len(poses)), [])
+def run_of(poses: np.ndarray, is_lost: np.ndarray) -> FilterRun:
+    n = len(poses)
+    return FilterRun(poses, np.zeros((n, 3, 3)), [], is_lost, np.ones(n), np.zeros(n), pd.DataFrame())
 
 
 def test_a_start_counts_after_two_seconds_and_never_is_an_error() -> None:
@@ -199,7 +201,7 @@ def test_the_fit_ignores_where_the_filter_was_wrong() -> None:
     official = compose(np.array([30.0, 5.0, -1.0]), truth)
     fitted = end_to_end.fit_official(official, run_of(estimate, np.zeros(N, dtype=bool)), 5)
     assert np.abs(relative_pose(truth, fitted)).max() < 0.03
-    failures = end_to_end.find_failures(np.arange(N) * 1_000_000, estimate, fitted)
+    failures = find_failures(np.arange(N) * 1_000_000, estimate, fitted)
     assert failures == [15]  # five seconds after the error began
 
 
@@ -317,11 +319,11 @@ def test_twenty_images_of_seq01_go_through_network_and_filters(
     (tmp_path / rall.POSES_PATH).mkdir(parents=True)
     np.savetxt(tmp_path / rall.POSES_PATH / number, poses)
     folder = tmp_path / rall.IMAGES_PATH / "seq02"
-    session = build_segment(real_root, "02", first, n, 5)
-    for i in range(n):
-        scan = make_scan(session, i)
+    segment = build_segment(real_root, "02", first, n, 5)
+    for index in range(n):
+        scan = make_scan(segment, index)
         image = polar_to_cartesian(scan.power, scan.azimuths, calibration=SDK)
-        save_image(folder / f"{i + 1}.png", np.rint(255.0 * image).astype(np.uint8))
+        save_image(folder / f"{index + 1}.png", np.rint(255.0 * image).astype(np.uint8))
     assert seq01.main(["--real-root", str(tmp_path), "--out", str(tmp_path / "out")]) == 0
     assert "published" in capsys.readouterr().out
     table = pd.read_csv(tmp_path / "out" / "seq02" / "results.csv").set_index("method")
