@@ -16,6 +16,7 @@ from rol.mcl import MclSettings
 from rol.pipeline import RadarLocalizer
 from rol.pix2pix import TrainedNetwork
 from rol_beyond.front_ends import evaluate_on_map
+from rol_beyond.local_map_odometry import LocalMapOdometry
 from rol_beyond.motion import MotionModel
 from rol_beyond.pipeline import FrontEnd, RobustLocalizer
 from rol_beyond.recovery import RecoveringFilter, RecoverySettings
@@ -143,6 +144,9 @@ def localize_from_starts(
         Estimates, the runs of one start after the other [m, m, rad].
     """
     grid = settings.filter.measurement.build_grid(map_points)
+    odometry = LocalMapOdometry()  # it does not depend on the start
+    motions = {scan.stamp_us: odometry.step(front_end(scan, None), scan.stamp_us) for scan in scans}
+    shared = SimpleNamespace(step=lambda points, stamp_us: motions[stamp_us])
     runs = []
     for start in starts:
         for seed in seeds:
@@ -150,8 +154,8 @@ def localize_from_starts(
             recovering = RecoveringFilter(
                 map_points, start, settings.filter, settings.recovery, rng, grid=grid
             )
-            radius = settings.density_radius_m
-            localizer = RobustLocalizer(recovering, front_end, density_radius_m=radius)
+            how = {"density_radius_m": settings.density_radius_m, "odometry": shared}
+            localizer = RobustLocalizer(recovering, front_end, **how)
             runs.append([localizer.step(scan).pose for scan in scans])
     return np.array(runs)
 
