@@ -254,16 +254,12 @@ def describe_misalignment(table: pd.DataFrame) -> dict[str, float]:
     Returns
     -------
     numbers : dict
-        ``lag_none`` (mean distance of the radar behind the lidar as recorded) [m], ``lag_per_speed`` [s],
-        ``lag_compensated`` (ahead of it when compensated) [m]; NaN without pairs.
+        ``lag_none`` (mean distance of the radar behind the lidar as recorded) and ``lag_compensated`` (ahead
+        of it when compensated) [m]; NaN without pairs.
     """
-    nearest = table[table.sweeps == "nearest"].astype({"speed_mps": float, "forward_m": float})
-    recorded, compensated = (nearest[nearest.motion == motion] for motion in MOTIONS)
-    return {
-        "lag_none": -recorded.forward_m.mean(),
-        "lag_per_speed": -(recorded.forward_m / recorded.speed_mps).mean(),
-        "lag_compensated": compensated.forward_m.mean(),
-    }
+    nearest = table[table.sweeps == "nearest"].astype({"forward_m": float})
+    means = nearest.groupby("motion").forward_m.mean().reindex(MOTIONS)
+    return {"lag_none": -means["none"], "lag_compensated": means["compensated"]}
 
 
 def compare_points(points: np.ndarray, lidar: np.ndarray) -> dict[str, float | int]:
@@ -634,30 +630,25 @@ def tabulate_on_map(
     return table.groupby("points", sort=False).mean()
 
 
-def describe_ceiling(table: pd.DataFrame, network: str) -> dict[str, float]:
+def describe_ceiling(table: pd.DataFrame) -> dict[str, float]:
     """Summarize the precision on the map beside that near real sweeps.
 
     Parameters
     ----------
     table : pandas.DataFrame
-        Rows as of `tabulate_on_map`: ``share_1m``, ``share_2m``, and ``sweep_1m``, the precision at 1 m near
-        one sweep as recorded (0..1), NaN for the rows of the lidar; it may be empty.
-    network : str
-        Row of the network of the text.
+        Rows as of `tabulate_on_map`: ``share_1m``, and ``sweep_1m``, the precision at 1 m near one sweep as
+        recorded (0..1), NaN for the rows of the lidar; it may be empty.
 
     Returns
     -------
     numbers : dict
-        Percentages: ``ceiling_1m`` and ``ceiling_2m`` of the lidar points of the nearest sweep, ``on_map`` of
-        the network; ``gain_min`` and ``gain_max``, by which the fraction near the map exceeds that near one
-        sweep; ``paper_min`` and ``paper_max``, the paper's 40 % with these added. NaN without a row.
+        Percentages: ``ceiling_1m`` of the lidar points of the nearest sweep; ``gain_min`` and ``gain_max``,
+        by which the fraction near the map exceeds that near one sweep; ``paper_min`` and ``paper_max``, the
+        paper's 40 % with these added. NaN without a row.
     """
-    table = 100 * table.reindex([*table.index.union(["lidar, nearest", network], sort=False)])
-    gain = table.share_1m - table.sweep_1m
+    gain = 100 * (table.share_1m - table.sweep_1m)
     return {
-        "ceiling_1m": table.share_1m["lidar, nearest"],
-        "ceiling_2m": table.share_2m["lidar, nearest"],
-        "on_map": table.share_1m[network],
+        "ceiling_1m": 100 * table.share_1m.get("lidar, nearest", np.nan),
         "gain_min": gain.min(),
         "gain_max": gain.max(),
         "paper_min": 40 + gain.min(),

@@ -458,13 +458,13 @@ def describe_submap(
     Returns
     -------
     numbers : dict
-        ``submap_s`` and ``submap_m``, duration and length of the path; ``submap_spread_mm`` between starts;
+        ``submap_s`` and ``submap_m``, duration and length of the path;
         ``submap_residual_m``, median distance of sweeps to the map; ``segment_low_m`` and ``segment_high_m``,
         smallest and largest shift forward of segments; ``submap_off_m`` and ``submap_worst_m``, mean and
         largest distance to the given poses, ``submap_deg``, their mean heading difference; ``changed_new``
         and ``changed_gone`` [%]; ``sharpest_deg``.
     """
-    names = ["submap_s", "submap_m", "submap_spread_mm", "submap_residual_m", "segment_low_m"]
+    names = ["submap_s", "submap_m", "submap_residual_m", "segment_low_m"]
     names += ["segment_high_m", "submap_off_m", "submap_worst_m", "submap_deg"]
     names += ["changed_new", "changed_gone", "sharpest_deg"]
     if registered is None:
@@ -472,7 +472,7 @@ def describe_submap(
     forward, (distance, heading) = segments.forward_m, registered.differences.T[2:]
     n_new, n_gone = len(changes.new), len(changes.gone)
     seconds, steps = np.ptp(registered.sweeps.stamps_us) / 1e6, np.diff(registered.path[:, :2], axis=0)
-    values = [seconds, np.hypot(*steps.T).sum(), 1000 * registered.spread_m]
+    values = [seconds, np.hypot(*steps.T).sum()]
     values += [np.median(registered.residuals_m), forward.min(), forward.max()]
     values += [distance.mean(), distance.max(), heading.mean()]
     values += [100 * n_new / (n_new + len(changes.same)), 100 * n_gone / (n_gone + len(changes.confirmed))]
