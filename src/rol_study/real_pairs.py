@@ -507,7 +507,7 @@ def tabulate_kinds(
             near = nn_distances(pair.lidar_points, cloud) < 1.0
             lidar.append(pd.DataFrame({"front_end": name, "top_m": pair.tops, "near": near}))
     kinds, reach = pd.concat(found), pd.concat(lidar)
-    zones, heights = ["0–4", "4–10", "over 10"], ["0–1", "1–2.5", "over 2.5"]
+    zones, heights = ["0‑4", "4‑10", "over 10"], ["0‑1", "1‑2.5", "over 2.5"]  # no line break at the hyphen
     zone = pd.cut(kinds.from_path_m, [0, ROAD_M, 10, np.inf], labels=zones, include_lowest=True)
     height = pd.cut(reach.top_m, [-np.inf, 1.0, 2.5, np.inf], labels=heights)
     is_off = kinds.distance_m >= 2.0

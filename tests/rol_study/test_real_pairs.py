@@ -85,7 +85,7 @@ def test_points_are_described_by_what_the_lidar_has_around_them() -> None:
     # One of two is hidden behind the wall, the other one is on the road.
     assert row["over 2 m off"].tolist() == [50.0, 25.0, 25.0]
     reached = row["lidar points reached, by height [m]"]
-    assert 0.0 < reached["over 2.5"] < reached["0–1"] < 100.0
+    assert 0.0 < reached["over 2.5"] < reached["0‑1"] < 100.0
     numbers = real_pairs.describe_kinds(kinds, "some")
     assert numbers["hidden"] == 25.0 and numbers["road_of_wrong"] == 50.0
 
