@@ -69,7 +69,7 @@ def format_calibration(calibration: pd.DataFrame, used: Mapping[str, str]) -> pd
 
 
 def format_comparison(comparison: Any, ways: Mapping[tuple[str, str], str]) -> pd.DataFrame:
-    """Format precision, recall and chance level [%] per front end below the paper's numbers.
+    """Format precision and recall [%] per front end below the paper's numbers.
 
     Parameters
     ----------
@@ -90,7 +90,6 @@ def format_comparison(comparison: Any, ways: Mapping[tuple[str, str], str]) -> p
         means = comparison.average(way)
         for key, label in labels.items():
             columns[title, label] = join_spread(means[key], means[f"{key}_sd"])
-        columns[title, "chance, 1 m"] = means.chance_1m.map("{:.0f}".format)
     columns["", "points"] = comparison.rows.groupby("front_end").n_points.mean().map("{:.0f}".format)
     table = pd.DataFrame(columns).reindex(["reported", *names])
     first = next(iter(ways.values()))

@@ -139,7 +139,7 @@ def draw_thresholds(table: Any, used: float) -> Figure:
         ax.plot(levels, scale * column.mean(), f"{mark}-", color=COLOURS[colour], label=label)
     axes[0].set(ylabel="points per scan", yscale="log")
     axes[1].set(ylabel="near the map [%]", ylim=(40, 100))
-    axes[1].legend(loc="lower right")
+    axes[1].legend(loc="lower left")
     for ax in axes:
         ax.axvline(used, color="#444444", linewidth=0.9)
         ax.set_xlabel("threshold on the grey value")

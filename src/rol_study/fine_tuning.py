@@ -1,6 +1,6 @@
 """Fine-tune a network on real Oxford pairs and evaluate it on real scans that it was not trained on.
 
-The eleven pairs lie within 2.5 s and 20 m of one street, so no part of them can serve as a test set. Two
+The eleven pairs lie within 2.7 s and 20 m of one street, so no part of them can serve as a test set. Two
 other sources can: one scan of another session at its published pose on the lidar map of RaLL, and the pairs
 of RADIATE, another radar in fog.
 """

@@ -270,31 +270,24 @@ def describe_mulran(study: MulranStudy | None, network: str) -> dict[str, float]
     study : MulranStudy or None
         The results.
     network : str
-        Front end of the keys ``mulran_...``; those of ``mulran_raw_...`` are of the raw peaks.
+        Front end of ``mulran_1m``; ``mulran_raw_1m`` is of the raw peaks.
 
     Returns
     -------
     numbers : dict
-        ``_1m``, ``_2m``, ``_map_1m``, ``_chance_1m`` (on the map) in percent; ``mulran_turn_deg`` (clockwise)
-        and ``mulran_shift_m`` of the raw peaks fitted to the keyframe; ``best_offset_m``; pose of the radar
-        in the frame of the published poses: ``frame_first_m`` behind at the scans, and medians while driving
-        of ``frame_forward_m`` behind, ``frame_left_m``, ``frame_deg``.
+        Precision at 1 m near the keyframe [%]; ``mulran_turn_deg`` (clockwise) of the raw peaks fitted to it;
+        ``best_offset_m``; pose of the radar in the frame of the published poses: ``frame_first_m`` behind at
+        the scans, and medians while driving of ``frame_forward_m`` behind, ``frame_left_m``, ``frame_deg``.
     """
-    kinds = {"1m": "share_1m", "2m": "share_2m", "map_1m": "share_1m_map", "chance_1m": "chance_1m_map"}
-    fronts = {"mulran": network, "mulran_raw": "raw"}
-    others = ["mulran_turn_deg", "mulran_shift_m", "best_offset_m"]
-    others += ["frame_first_m", "frame_forward_m", "frame_left_m", "frame_deg"]
+    names = ["mulran_1m", "mulran_raw_1m", "mulran_turn_deg", "best_offset_m"]
+    names += ["frame_first_m", "frame_forward_m", "frame_left_m", "frame_deg"]
     if study is None:
-        return dict.fromkeys([*(f"{name}_{kind}" for name in fronts for kind in kinds), *others], np.nan)
-    numbers = {
-        f"{name}_{kind}": 100 * study.precision.loc[front, column]
-        for name, front in fronts.items()
-        for kind, column in kinds.items()
-    }
-    fit, driving = study.offsets.loc[OFFSET_M], np.median(study.frame[1:], axis=0)
-    values = [-fit.turn_deg, np.hypot(fit.forward_m, fit.left_m), study.offsets.score.idxmax()]
+        return dict.fromkeys(names, np.nan)
+    driving = np.median(study.frame[1:], axis=0)
+    values = [*(100 * study.precision.share_1m[[network, "raw"]])]
+    values += [-study.offsets.turn_deg[OFFSET_M], study.offsets.score.idxmax()]
     values += [-study.frame[0, 0], -driving[0], driving[1], np.rad2deg(driving[2])]
-    return numbers | dict(zip(others, map(float, values), strict=True))
+    return dict(zip(names, map(float, values), strict=True))
 
 
 def tabulate_mulran(study: MulranStudy) -> pd.DataFrame:

@@ -13,7 +13,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pandas as pd
-from scipy.ndimage import gaussian_filter, gaussian_filter1d, uniform_filter1d
+from scipy.ndimage import gaussian_filter1d
 from scipy.optimize import minimize
 from scipy.spatial import cKDTree
 
@@ -300,7 +300,7 @@ class RadarAgreement:
         clouds = [crop_range(pair.lidar_points, max_range, min_range) for pair in pairs]
         self.points = [cloud[:: len(cloud) // max_points + 1] for cloud in clouds if len(cloud)]
         pairs = [pair for pair, cloud in zip(pairs, clouds, strict=True) if len(cloud)]
-        self.images = [_sharpen_polar(pair.radar.power) for pair in pairs]
+        self.images = [pair.sharpened for pair in pairs]
         self.azimuths = [pair.radar.azimuths for pair in pairs]
         self.twists = [pair.scan.twist for pair in pairs]
 
@@ -376,15 +376,6 @@ def _sandwich_errors(
     inverse = np.linalg.pinv(curvature) / len(gradients)
     gradients = gradients - gradients.mean(axis=0)
     return np.sqrt(np.diag(inverse @ (gradients.T @ gradients) @ inverse))
-
-
-def _sharpen_polar(power: np.ndarray) -> np.ndarray:
-    """Subtract the mean of 8 m along range and smooth by about the radar's own point spread."""
-    values = power.astype(np.float32)
-    values = gaussian_filter(
-        values - uniform_filter1d(values, 183, axis=1), (0.7, 3.0), mode=("wrap", "nearest")
-    )
-    return np.concatenate([values[-1:], values, values[:1]])
 
 
 def _beam_at(

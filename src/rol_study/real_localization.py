@@ -16,6 +16,7 @@ from rol.mcl import MclSettings
 from rol.pipeline import RadarLocalizer
 from rol.pix2pix import TrainedNetwork
 from rol_beyond.front_ends import evaluate_on_map
+from rol_beyond.local_map_odometry import LocalMapOdometry
 from rol_beyond.motion import MotionModel
 from rol_beyond.pipeline import RobustLocalizer
 from rol_beyond.recovery import RecoveringFilter, RecoverySettings
@@ -145,6 +146,9 @@ def localize_from_starts(
         Estimates, the runs of one start after the other [m, m, rad].
     """
     grid = settings.filter.measurement.build_grid(map_points)
+    odometry = LocalMapOdometry()  # it does not depend on the start
+    motions = {scan.stamp_us: odometry.step(front_end(scan, None), scan.stamp_us) for scan in scans}
+    shared = SimpleNamespace(step=lambda points, stamp_us: motions[stamp_us], deskew=odometry.deskew)
     runs = []
     for start in starts:
         for seed in seeds:
@@ -152,9 +156,11 @@ def localize_from_starts(
             recovering = RecoveringFilter(
                 map_points, start, settings.filter, settings.recovery, rng, grid=grid
             )
-            radius = settings.density_radius_m
             localizer = RobustLocalizer(
-                recovering, lambda scan: front_end(scan, None), density_radius_m=radius
+                recovering,
+                lambda scan: front_end(scan, None),
+                density_radius_m=settings.density_radius_m,
+                odometry=shared,
             )
             runs.append([localizer.step(scan).pose for scan in scans])
     return np.array(runs)
@@ -306,25 +312,22 @@ def describe_runs(localized: Mapping[str, Localized]) -> dict[str, float]:
     Returns
     -------
     numbers : dict
-        ``<front end>_first_m``: median at the first scan; ``<front end>_worst_m`` and ``_worst_deg``: largest
-        errors from `FROM_SCAN` on. NaN without runs.
+        ``<front end>_worst_m`` and ``_worst_deg``: largest errors from `FROM_SCAN` on. NaN without runs.
     """
     numbers = {}
     for name in ("fake", "raw"):
-        summary = {"median": np.full((1, 2), np.nan), "worst": (np.nan, np.nan)}
-        if name in localized and localized[name].poses:
-            summary = localized[name].summary
-        numbers[f"{name}_first_m"] = float(summary["median"][0][0])
-        numbers[f"{name}_worst_m"], numbers[f"{name}_worst_deg"] = map(float, summary["worst"])
+        is_there = name in localized and localized[name].poses
+        worst = localized[name].summary["worst"] if is_there else (np.nan, np.nan)
+        numbers[f"{name}_worst_m"], numbers[f"{name}_worst_deg"] = map(float, worst)
     return numbers
 
 
 def describe_alone(errors: np.ndarray) -> dict[str, float]:
-    """Name the errors of `localize_alone` for a text: medians ``lone_m`` and ``lone_deg``, and ``lone_met``,
-    the percentage within `LIMITS`; NaN without scans."""
+    """Name the errors of `localize_alone` for a text: median ``lone_m``, and ``lone_met``, the percentage
+    within `LIMITS`; NaN without scans."""
     table = pd.DataFrame(errors.reshape(-1, 2), columns=["m", "deg"])
     met = (table <= np.array(LIMITS)).all(axis=1).astype(float)
-    return {"lone_m": table.m.median(), "lone_deg": table.deg.median(), "lone_met": 100 * met.mean()}
+    return {"lone_m": table.m.median(), "lone_met": 100 * met.mean()}
 
 
 def tabulate_runs(by_map: Mapping[str, Mapping[str, Localized]], labels: Mapping[str, str]) -> pd.DataFrame:
@@ -500,20 +503,13 @@ def evaluate_turn(
 
 
 def describe_turn(table: pd.DataFrame | None) -> dict[str, float]:
-    """Name the median errors of `evaluate_turn` for a text.
+    """Name the median position errors of generated points of `evaluate_turn` for a text.
 
-    ``<variant>_<front end>_m`` and ``_deg`` with the variants "recorded", "compensated" and "turned"; NaN for
-    a variant that the table lacks, and without a table.
+    ``recorded_fake_m`` and ``compensated_fake_m``; NaN for a variant that the table lacks, and without a
+    table.
     """
-    rows = {} if table is None else table[["m", "deg"]].to_dict("index")
-    keys = [
-        (variant, front) for variant in ("recorded", "compensated", "turned") for front in ("fake", "raw")
-    ]
-    return {
-        f"{variant}_{front}_{unit}": rows.get((variant, front), {}).get(unit, np.nan)
-        for variant, front in keys
-        for unit in ("m", "deg")
-    }
+    medians = {} if table is None else table.m.to_dict()
+    return {f"{v}_fake_m": medians.get((v, "fake"), np.nan) for v in ("recorded", "compensated")}
 
 
 def tabulate_turns(turns: Mapping[int, tuple[pd.DataFrame, Any]], labels: Mapping[str, str]) -> pd.DataFrame:

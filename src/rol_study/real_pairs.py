@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pandas as pd
-from scipy.ndimage import minimum_filter1d
+from scipy.ndimage import gaussian_filter, minimum_filter1d, uniform_filter1d
 from scipy.spatial import cKDTree
 
 from rol.bev import image_to_points, points_to_image
@@ -45,6 +45,8 @@ Pairs = Mapping[tuple[str, str], "Pair"]  # of one scan: (motion, sweeps) -> pai
 COLUMNS = ["timestamp_us", "front_end", "motion", "sweeps", "n_points", "n_lidar_points", "precision_1m"]
 COLUMNS += ["precision_2m", "recall_1m", "recall_2m", "misalignment_forward_m", "misalignment_left_m"]
 PIXEL_M = 0.25
+ROAD_M = 4.0  # half the width of the corridor along the path that counts as road [m]
+POINTS, OFF = "points, by m from path", "over 2 m off"  # columns of `tabulate_kinds`
 OWN_VEHICLE_M = 4.0  # nearer lidar points may be on the vehicle itself [m]
 
 
@@ -120,6 +122,15 @@ class Pair:
         ranges = {"range_resolution": calibration.resolution_m, "range_offset": calibration.offset_m}
         settings = PairSettings(motion, **ranges)
         return radar_to_image(self.radar.power, self.radar.azimuths, self.twist, settings)
+
+    @cached_property
+    def sharpened(self) -> np.ndarray:
+        """Power of the scan less its mean over 8 m of range, smoothed by about the radar's own point spread;
+        rows repeated at both ends, shape (a + 2, b), float32."""
+        values = self.radar.power.astype(np.float32)
+        values -= uniform_filter1d(values, 183, axis=1)
+        values = gaussian_filter(values, (0.7, 3.0), mode=("wrap", "nearest"))
+        return np.concatenate([values[-1:], values, values[:1]])
 
     @cached_property
     def misalignment(self) -> tuple[float, float]:
@@ -243,16 +254,12 @@ def describe_misalignment(table: pd.DataFrame) -> dict[str, float]:
     Returns
     -------
     numbers : dict
-        ``lag_none`` (mean distance of the radar behind the lidar as recorded) [m], ``lag_per_speed`` [s],
-        ``lag_compensated`` (ahead of it when compensated) [m]; NaN without pairs.
+        ``lag_none`` (mean distance of the radar behind the lidar as recorded) and ``lag_compensated`` (ahead
+        of it when compensated) [m]; NaN without pairs.
     """
-    nearest = table[table.sweeps == "nearest"].astype({"speed_mps": float, "forward_m": float})
-    recorded, compensated = (nearest[nearest.motion == motion] for motion in MOTIONS)
-    return {
-        "lag_none": -recorded.forward_m.mean(),
-        "lag_per_speed": -(recorded.forward_m / recorded.speed_mps).mean(),
-        "lag_compensated": compensated.forward_m.mean(),
-    }
+    nearest = table[table.sweeps == "nearest"].astype({"forward_m": float})
+    means = nearest.groupby("motion").forward_m.mean().reindex(MOTIONS)
+    return {"lag_none": -means["none"], "lag_compensated": means["compensated"]}
 
 
 def compare_points(points: np.ndarray, lidar: np.ndarray) -> dict[str, float | int]:
@@ -275,8 +282,8 @@ def compare_points(points: np.ndarray, lidar: np.ndarray) -> dict[str, float | i
     return scores
 
 
-def chance_level(points: np.ndarray, lidar: np.ndarray, n_turns: int = 8) -> dict[str, float]:
-    """Compute the precision of points that are turned to wrong headings.
+def chance_level(points: np.ndarray, lidar: np.ndarray, n_turns: int = 8) -> float:
+    """Compute the precision at 1 m of points that are turned to wrong headings.
 
     Parameters
     ----------
@@ -287,14 +294,12 @@ def chance_level(points: np.ndarray, lidar: np.ndarray, n_turns: int = 8) -> dic
 
     Returns
     -------
-    precision : dict
-        ``precision_1m`` and ``precision_2m``, means over the wrong headings.
+    precision : float
+        Mean over the wrong headings, 0..1.
     """
-    tree, found = cKDTree(lidar), []
-    for turn in 2.0 * np.pi * np.arange(1, n_turns) / n_turns:
-        distances = tree.query(transform_points((0.0, 0.0, turn), points))[0]
-        found.append([fraction_within(distances, 1.0), fraction_within(distances, 2.0)])
-    return dict(zip(("precision_1m", "precision_2m"), np.mean(found, axis=0).tolist(), strict=True))
+    tree, turns = cKDTree(lidar), 2.0 * np.pi * np.arange(1, n_turns) / n_turns
+    turned = [transform_points((0.0, 0.0, turn), points) for turn in turns]
+    return float(np.mean([fraction_within(tree.query(cloud)[0], 1.0) for cloud in turned]))
 
 
 # ---- ground ----
@@ -490,8 +495,8 @@ def tabulate_kinds(
     table : pandas.DataFrame
         One row per front end, percentages over all pairs: of ``points`` by distance from the path; of these
         ``within 1 m`` of a lidar point; of the ``lidar points reached`` within 1 m, by the height of the
-        highest in the pixel; and of points ``over 2 m off``, all and those in view, see `describe_points`.
-        Empty without pairs.
+        highest in the pixel; and of points ``over 2 m off``, all, those in view, see `describe_points`, and
+        those within 4 m of the path. Empty without pairs.
     """
     if not pairs:
         return pd.DataFrame()
@@ -502,35 +507,42 @@ def tabulate_kinds(
             near = nn_distances(pair.lidar_points, cloud) < 1.0
             lidar.append(pd.DataFrame({"front_end": name, "top_m": pair.tops, "near": near}))
     kinds, reach = pd.concat(found), pd.concat(lidar)
-    zone = pd.cut(
-        kinds.from_path_m, [0, 4, 10, np.inf], labels=["0-4 m", "4-10 m", "beyond"], include_lowest=True
-    )
-    height = pd.cut(reach.top_m, [-np.inf, 1.0, 2.5, np.inf], labels=["below 1 m", "1-2.5 m", "higher"])
+    zones, heights = ["0‑4", "4‑10", "over 10"], ["0‑1", "1‑2.5", "over 2.5"]  # no line break at the hyphen
+    zone = pd.cut(kinds.from_path_m, [0, ROAD_M, 10, np.inf], labels=zones, include_lowest=True)
+    height = pd.cut(reach.top_m, [-np.inf, 1.0, 2.5, np.inf], labels=heights)
     is_off = kinds.distance_m >= 2.0
-    kinds = kinds.assign(
-        zone=zone, right=kinds.distance_m < 1.0, all=is_off, in_view=is_off & ~kinds.is_hidden
-    )
+    off = {"all": is_off, "in view": is_off & ~kinds.is_hidden, "on road": is_off & (zone == zones[0])}
+    kinds = kinds.assign(zone=zone, right=kinds.distance_m < 1.0, **off)
     own = kinds.groupby("front_end", sort=False)
     by_zone = kinds.groupby(["front_end", "zone"], sort=False, observed=False)
     by_height = reach.assign(height=height).groupby(["front_end", "height"], sort=False, observed=False)
     parts = {
-        "points": by_zone.size().unstack().div(own.size(), axis=0),
-        "within 1 m": by_zone.right.mean().unstack(),
-        "lidar points reached": by_height.near.mean().unstack(),
-        "over 2 m off": own[["all", "in_view"]].mean().rename(columns={"in_view": "in view"}),
+        POINTS: by_zone.size().unstack().div(own.size(), axis=0),
+        "within 1 m, by m from path": by_zone.right.mean().unstack(),
+        "lidar points reached, by height [m]": by_height.near.mean().unstack(),
+        OFF: own[list(off)].mean(),
     }
     return 100.0 * pd.concat(parts, axis=1)
 
 
 def describe_kinds(table: pd.DataFrame, network: str) -> dict[str, float]:
-    """Name percentages of `tabulate_kinds` for a text: ``on_road`` (within 4 m of the path), ``in_view`` and
-    ``hidden`` (more than 2 m off) of a network's points; NaN with an empty table."""
+    """Name percentages of `tabulate_kinds` for a text; NaN with an empty table.
+
+    ``on_road`` (within 4 m of the path), ``wrong`` (more than 2 m off), of these ``in_view``, ``hidden`` and
+    ``wrong_on_road``, all of a network's points; ``road_of_wrong``, the wrong ones on the road of all wrong.
+    """
     if table.empty:
-        return dict.fromkeys(("on_road", "in_view", "hidden"), np.nan)
-    own = table.loc[network]
-    in_view = own["over 2 m off", "in view"]
-    hidden = own["over 2 m off", "all"] - in_view
-    return {"on_road": own["points", "0-4 m"], "in_view": in_view, "hidden": hidden}
+        names = ("on_road", "wrong", "in_view", "hidden", "wrong_on_road", "road_of_wrong")
+        return dict.fromkeys(names, np.nan)
+    wrong, in_view, wrong_on_road = table.loc[network, OFF]
+    return {
+        "on_road": table.loc[network, POINTS].iloc[0],
+        "wrong": wrong,
+        "in_view": in_view,
+        "hidden": wrong - in_view,
+        "wrong_on_road": wrong_on_road,
+        "road_of_wrong": 100.0 * wrong_on_road / wrong if wrong else np.nan,
+    }
 
 
 def tabulate_corrected(
@@ -618,30 +630,25 @@ def tabulate_on_map(
     return table.groupby("points", sort=False).mean()
 
 
-def describe_ceiling(table: pd.DataFrame, network: str) -> dict[str, float]:
+def describe_ceiling(table: pd.DataFrame) -> dict[str, float]:
     """Summarize the precision on the map beside that near real sweeps.
 
     Parameters
     ----------
     table : pandas.DataFrame
-        Rows as of `tabulate_on_map`: ``share_1m``, ``share_2m``, and ``sweep_1m``, the precision at 1 m near
-        one sweep as recorded (0..1), NaN for the rows of the lidar; it may be empty.
-    network : str
-        Row of the network of the text.
+        Rows as of `tabulate_on_map`: ``share_1m``, and ``sweep_1m``, the precision at 1 m near one sweep as
+        recorded (0..1), NaN for the rows of the lidar; it may be empty.
 
     Returns
     -------
     numbers : dict
-        Percentages: ``ceiling_1m`` and ``ceiling_2m`` of the lidar points of the nearest sweep, ``on_map`` of
-        the network; ``gain_min`` and ``gain_max``, by which the fraction near the map exceeds that near one
-        sweep; ``paper_min`` and ``paper_max``, the paper's 40 % with these added. NaN without a row.
+        Percentages: ``ceiling_1m`` of the lidar points of the nearest sweep; ``gain_min`` and ``gain_max``,
+        by which the fraction near the map exceeds that near one sweep; ``paper_min`` and ``paper_max``, the
+        paper's 40 % with these added. NaN without a row.
     """
-    table = 100 * table.reindex([*table.index.union(["lidar, nearest", network], sort=False)])
-    gain = table.share_1m - table.sweep_1m
+    gain = 100 * (table.share_1m - table.sweep_1m)
     return {
-        "ceiling_1m": table.share_1m["lidar, nearest"],
-        "ceiling_2m": table.share_2m["lidar, nearest"],
-        "on_map": table.share_1m[network],
+        "ceiling_1m": 100 * table.share_1m.get("lidar, nearest", np.nan),
         "gain_min": gain.min(),
         "gain_max": gain.max(),
         "paper_min": 40 + gain.min(),
@@ -720,15 +727,14 @@ class Comparison:
     ----------
     rows : pandas.DataFrame
         One row per scan, motion, reference and front end, with the columns `COLUMNS`.
-    chance : pandas.DataFrame
-        One row per scan, front end, and each of `AS_IN_PAPER` and `BEST`: ``front_end``, ``motion``,
-        ``chance_1m``, as of `chance_level`.
+    chance_1m : float
+        Mean of `chance_level` over scans, front ends, `AS_IN_PAPER` and `BEST` (0..1).
     points, images : dict
         (stamp of a scan [us], motion) -> what `front_end_points` returns; of the scans asked for.
     """
 
     rows: pd.DataFrame
-    chance: pd.DataFrame
+    chance_1m: float
     points: dict[tuple[int, str], dict[str, np.ndarray]]
     images: dict[tuple[int, str], dict[str, np.ndarray]]
 
@@ -738,20 +744,19 @@ class Comparison:
         Parameters
         ----------
         way : tuple of str
-            `AS_IN_PAPER` or `BEST`; another one has no level by chance.
+            One of `MOTIONS` and one of `REFERENCES`.
 
         Returns
         -------
         table : pandas.DataFrame
             One row per front end: ``precision_1m``, ``precision_2m``, ``recall_1m`` and their standard
-            deviations ``<name>_sd``, and ``chance_1m`` [%].
+            deviations ``<name>_sd`` [%].
         """
         motion, sweeps = way
         rows = self.rows[(self.rows.motion == motion) & (self.rows.sweeps == sweeps)]
         names = ["precision_1m", "precision_2m", "recall_1m"]
         groups = rows.groupby("front_end", sort=False)[names]
-        chance = self.chance[self.chance.motion == motion].groupby("front_end", sort=False).chance_1m.mean()
-        return 100 * groups.mean().join(groups.std().add_suffix("_sd")).assign(chance_1m=chance)
+        return 100 * groups.mean().join(groups.std().add_suffix("_sd"))
 
 
 def compare_front_ends(
@@ -791,15 +796,9 @@ def compare_front_ends(
             own = {way: pair for way, pair in pairs.items() if way[0] == motion}
             rows += [row for pair in own.values() for row in tabulate(pair, clouds)]
             for way in {AS_IN_PAPER, BEST} & set(own):
-                for name, cloud in clouds.items():
-                    level = chance_level(cloud, own[way].lidar_points)["precision_1m"]
-                    chance.append((name, motion, level))
-    return Comparison(
-        pd.DataFrame(rows, columns=COLUMNS),
-        pd.DataFrame(chance, columns=["front_end", "motion", "chance_1m"]),
-        points,
-        images,
-    )
+                chance += [chance_level(cloud, own[way].lidar_points) for cloud in clouds.values()]
+    chance_1m = pd.Series(chance, dtype=float).mean()
+    return Comparison(pd.DataFrame(rows, columns=COLUMNS), chance_1m, points, images)
 
 
 def describe_comparison(comparison: Comparison, front_ends: Iterable[str]) -> dict[str, float]:
@@ -832,7 +831,7 @@ def describe_comparison(comparison: Comparison, front_ends: Iterable[str]) -> di
     }
     return {
         **numbers,
-        "chance_1m": 100 * comparison.chance.chance_1m.astype(float).mean(),
+        "chance_1m": 100 * comparison.chance_1m,
         "gain_sweeps": level["none", "turn"] - level[AS_IN_PAPER],
         "gain_motion": level["compensated", "nearest"] - level[AS_IN_PAPER],
     }

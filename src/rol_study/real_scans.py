@@ -217,20 +217,12 @@ def tabulate_precision(table: pd.DataFrame) -> pd.DataFrame:
 def describe_precision(table: pd.DataFrame, network: str) -> dict[str, float]:
     """Summarize the table of `evaluate_front_ends` in percent, NaN without scans.
 
-    ``near_1m``, ``near_2m``, ``chance_1m`` of the network and ``raw_1m``, ``raw_2m`` of the raw peaks: means
-    over the scans.
+    ``near_1m`` and ``chance_1m`` of the network and ``raw_1m`` of the raw peaks: means over the scans.
     """
-    names = ["share_1m", "share_2m", "chance_1m"]
+    names = ["share_1m", "chance_1m"]
     means = 100 * table.groupby("points")[names].mean().astype(float).reindex([network, "raw"])
-    near_1m, near_2m, chance_1m = means.loc[network]
-    raw_1m, raw_2m, _ = means.loc["raw"]
-    return {
-        "near_1m": near_1m,
-        "near_2m": near_2m,
-        "chance_1m": chance_1m,
-        "raw_1m": raw_1m,
-        "raw_2m": raw_2m,
-    }
+    near_1m, chance_1m = means.loc[network]
+    return {"near_1m": near_1m, "chance_1m": chance_1m, "raw_1m": means.share_1m["raw"]}
 
 
 # ---- RADIATE ----
@@ -309,12 +301,10 @@ def tabulate_fog(table: pd.DataFrame) -> pd.DataFrame:
 
 
 def describe_fog(table: pd.DataFrame, network: str) -> dict[str, float]:
-    """Summarize the table of `evaluate_pairs` in percent, NaN without pairs: ``fog_1m`` and ``fog_2m`` of the
-    network, ``fog_raw_1m`` and ``fog_raw_2m`` of the raw peaks."""
-    means = table.groupby("points")[["share_1m", "share_2m"]].mean().astype(float)
-    means = 100 * means.reindex([network, "raw"])
-    rows = {"fog": means.loc[network], "fog_raw": means.loc["raw"]}
-    return {f"{name}_{r}m": row[f"share_{r}m"] for name, row in rows.items() for r in (1, 2)}
+    """Summarize the table of `evaluate_pairs` in percent, NaN without pairs: ``fog_1m`` of the network,
+    ``fog_raw_1m`` of the raw peaks."""
+    means = 100 * table.groupby("points").share_1m.mean().astype(float).reindex([network, "raw"])
+    return {"fog_1m": means[network], "fog_raw_1m": means["raw"]}
 
 
 def describe_adaptation(curves: Mapping[str, pd.DataFrame], level: float) -> dict[str, float]:

@@ -18,19 +18,17 @@ from scipy.spatial import cKDTree
 
 from rol.evaluation import pose_errors
 from rol.geometry import compose, exp, invert, log, relative_pose, transform_points
-from rol.lidar import crop_range, relate_sensors, remove_ground, sweep_to_radar
+from rol.lidar import crop_range, remove_ground
 from rol.maps import accumulate_map, register_maps, residuals_along, to_first_map
 from rol.oxford import (
-    EXTRINSICS,
     RadarOdometry,
     compose_odometry,
     load_radar_odometry,
     load_timestamps,
-    load_velodyne_binary,
 )
 from rol.radar import deskew_points
 from rol_beyond.augmentation import rotate_points
-from rol_data.oxford_pairs import SWEEP_SECONDS, firing_fractions
+from rol_data.oxford_pairs import Sweep, load_sweep_points
 from rol_data.rall import SCANS_PATH
 
 SWEEPS_PATH = Path("oxford_car_visualiser2/data")  # below the folder of the real data
@@ -38,7 +36,6 @@ SENSOR = "velodyne_left"
 MIN_HITS = 20  # sweeps that must hit a cell: those of one second, longer than a moving vehicle covers it
 # Stages of `rol.maps.register_maps` for a segment near its place.
 SEGMENT_STAGES = ((np.inf, 2.0, 0.5, 0.25), (np.inf, 1.0, 0.3, 0.25))
-STAMP_POSITION = 0.0  # of a sweep's stamp within its turn: 0 the beginning, 1 the end
 
 
 class SubmapError(ValueError):
@@ -109,53 +106,13 @@ def interpolate_odometry(odometry: RadarOdometry, stamps_us: np.ndarray) -> tupl
     return compose(poses[i], exp(twists, (stamps - mids[i]) / 1e6)), twists
 
 
-def load_cloud(
-    path: Path,
-    twist: np.ndarray,
-    *,
-    stamp_position: float = STAMP_POSITION,
-    min_height: float = -1.5,
-    max_range: float = 64.0,
-) -> np.ndarray:
-    """Read one sweep, compensate the motion, and remove the ground.
-
-    Parameters
-    ----------
-    path : Path
-        The `.bin`.
-    twist : array, shape (3,)
-        Body velocity of the radar [m/s, m/s, rad/s].
-    stamp_position : float
-        Position of the stamp within the sweep: 0 the beginning, 0.5 the middle, 1 the end.
-    min_height, max_range : float
-        Lowest z and largest range of the points kept, in the radar frame [m].
-
-    Returns
-    -------
-    points : array, shape (n, 2)
-        Points in the radar frame at the sweep's stamp [m].
-
-    Raises
-    ------
-    rol.oxford.OxfordError
-        If the file is missing or at fault.
-    """
-    points = load_velodyne_binary(path)
-    seconds = (firing_fractions(points) - stamp_position) * SWEEP_SECONDS
-    points = sweep_to_radar(points, relate_sensors(EXTRINSICS["radar"], EXTRINSICS[SENSOR]))[:, :3]
-    points = deskew_points(points, seconds, twist)
-    return crop_range(remove_ground(points, min_height), max_range)[:, :2]
-
-
-def load_placed_sweeps(real_root: Path | str, stamp_position: float = STAMP_POSITION) -> PlacedSweeps:
-    """Read all listed sweeps and place them along the official odometry.
+def load_placed_sweeps(real_root: Path | str) -> PlacedSweeps:
+    """Read all listed sweeps, compensate the motion, and place them along the official odometry.
 
     Parameters
     ----------
     real_root : path
         Folder of the real data, see `rol_data.rall.find_real_root`.
-    stamp_position : float
-        As in `load_cloud`.
 
     Returns
     -------
@@ -173,10 +130,12 @@ def load_placed_sweeps(real_root: Path | str, stamp_position: float = STAMP_POSI
     stamps, valid = load_timestamps(folder / f"{SENSOR}.timestamps")
     odometry = load_radar_odometry(Path(real_root) / SCANS_PATH / "gt" / "radar_odometry.csv")
     poses, twists = interpolate_odometry(odometry, stamps[valid])
-    clouds = [
-        load_cloud(folder / "binaries" / f"{stamp}.bin", twist, stamp_position=stamp_position)
-        for stamp, twist in zip(stamps[valid], twists, strict=True)
-    ]
+    clouds = []
+    for stamp, twist in zip(stamps[valid].tolist(), twists, strict=True):
+        sweep = Sweep(folder / "binaries" / f"{stamp}.bin", SENSOR, stamp)
+        points, seconds = load_sweep_points(sweep)
+        points = deskew_points(points[:, :3], seconds, twist)
+        clouds.append(crop_range(remove_ground(points))[:, :2])
     scan_stamps, _, scan_poses = compose_odometry(odometry)
     scan_poses = relative_pose(poses[0], scan_poses)
     return PlacedSweeps(stamps[valid], clouds, relative_pose(poses[0], poses), scan_stamps, scan_poses)
@@ -499,18 +458,22 @@ def describe_submap(
     Returns
     -------
     numbers : dict
-        ``submap_spread_mm`` between starts; ``submap_residual_m``, median distance of sweeps to the map;
-        ``segment_low_m`` and ``segment_high_m``, smallest and largest shift forward of segments;
-        ``submap_off_m`` and ``submap_worst_m``, mean and largest distance to the given poses, ``submap_deg``,
-        their mean heading difference; ``changed_new`` and ``changed_gone`` [%]; ``sharpest_deg``.
+        ``submap_s`` and ``submap_m``, duration and length of the path;
+        ``submap_residual_m``, median distance of sweeps to the map; ``segment_low_m`` and ``segment_high_m``,
+        smallest and largest shift forward of segments; ``submap_off_m`` and ``submap_worst_m``, mean and
+        largest distance to the given poses, ``submap_deg``, their mean heading difference; ``changed_new``
+        and ``changed_gone`` [%]; ``sharpest_deg``.
     """
-    names = ["submap_spread_mm", "submap_residual_m", "segment_low_m", "segment_high_m", "submap_off_m"]
-    names += ["submap_worst_m", "submap_deg", "changed_new", "changed_gone", "sharpest_deg"]
+    names = ["submap_s", "submap_m", "submap_residual_m", "segment_low_m"]
+    names += ["segment_high_m", "submap_off_m", "submap_worst_m", "submap_deg"]
+    names += ["changed_new", "changed_gone", "sharpest_deg"]
     if registered is None:
         return dict.fromkeys(names, np.nan)
     forward, (distance, heading) = segments.forward_m, registered.differences.T[2:]
     n_new, n_gone = len(changes.new), len(changes.gone)
-    values = [1000 * registered.spread_m, np.median(registered.residuals_m), forward.min(), forward.max()]
+    seconds, steps = np.ptp(registered.sweeps.stamps_us) / 1e6, np.diff(registered.path[:, :2], axis=0)
+    values = [seconds, np.hypot(*steps.T).sum()]
+    values += [np.median(registered.residuals_m), forward.min(), forward.max()]
     values += [distance.mean(), distance.max(), heading.mean()]
     values += [100 * n_new / (n_new + len(changes.same)), 100 * n_gone / (n_gone + len(changes.confirmed))]
     return dict(zip(names, [*map(float, values), sharpest_deg], strict=True))

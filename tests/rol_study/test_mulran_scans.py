@@ -66,5 +66,5 @@ def test_the_real_scans(real_root: Path) -> None:
 
 def test_without_scans_there_are_no_numbers() -> None:
     numbers = mulran_scans.describe_mulran(None, "unet")
-    assert {"mulran_1m", "mulran_raw_map_1m", "frame_deg"} <= set(numbers)
+    assert {"mulran_1m", "mulran_raw_1m", "frame_deg"} <= set(numbers)
     assert np.isnan(list(numbers.values())).all()

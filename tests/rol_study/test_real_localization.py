@@ -85,8 +85,9 @@ def test_variants_of_a_turn_get_the_twist_and_the_azimuths() -> None:
     assert table.loc[("recorded", "raw"), ["share_1m", "share_2m", "worst_m"]].tolist() == [0.0, 1.0, 1.5]
     assert table.loc[("turned", "raw"), ["share_1m", "m", "deg"]].tolist() == [1.0, 0.0, 1.5]
     assert set(points) == set(table.index)
-    numbers = real_localization.describe_turn(table.rename(index={"recorded": "compensated"}, level=0))
-    assert numbers["compensated_raw_deg"] == 1.5 and np.isnan(numbers["recorded_raw_m"])
+    named = table.rename(index={"recorded": "compensated"}, level=0).rename(index={"raw": "fake"}, level=1)
+    numbers = real_localization.describe_turn(named)
+    assert numbers["compensated_fake_m"] == 0.75 and np.isnan(numbers["recorded_fake_m"])
     assert np.isnan(list(real_localization.describe_turn(None).values())).all()
 
 
@@ -102,7 +103,7 @@ def test_drives_are_localized_and_their_errors_named() -> None:
     assert [poses.shape for poses in runs["raw"].poses] == [(8, 4, 3), (8, 1, 3)]
     assert set(runs["raw"].first_run()) == {scan.stamp_us for scan in scans}
     numbers = real_localization.describe_runs(runs)
-    assert numbers["raw_worst_m"] < 0.6 and np.isnan(numbers["fake_first_m"])
+    assert numbers["raw_worst_m"] < 0.6 and np.isnan(numbers["fake_worst_m"])
     table = real_localization.tabulate_runs({"room": runs, "none": {}}, {"raw": "k-strongest"})
     assert table[["map", "points"]].values.tolist() == [["room", "k-strongest"]]
     assert table["worst [m]"][0] == numbers["raw_worst_m"]
