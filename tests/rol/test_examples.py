@@ -234,12 +234,9 @@ def test_radar_of_ones_own_is_localized(tmp_path: Path) -> None:
 
 def test_session_of_ones_own_is_read_as_oxfords_and_aligned(tmp_path: Path) -> None:
     printed = run_with_packages("Write Oxford's files", tmp_path)
-    assert printed.splitlines()[0] == "[]"
     for place in re.findall(r"(\d+\.\d+) m to the left", printed):
         assert abs(float(place) - 20.0) <= 0.25
     pytest.importorskip("papermill")
-    shutil.rmtree(tmp_path / "sessions/my-town/velodyne_right")  # one lidar is enough, as the page says
-    (tmp_path / "sessions/my-town/velodyne_right.timestamps").unlink()
     command = dict(code_blocks(OWN_RADAR, "Write Oxford's files"))["bash"]
     words = shlex.split(command.replace("\\\n", ""))
     (tmp_path / "notebooks").mkdir()
