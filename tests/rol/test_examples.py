@@ -250,7 +250,7 @@ def test_session_of_ones_own_is_read_as_oxfords_and_aligned(tmp_path: Path) -> N
     summary = json.loads(
         (tmp_path / "build/my-town/alignment/my-town/summary.json").read_text(encoding="utf-8")
     )
-    assert summary["n_aligned"] == summary["n_scans"] == 4
+    assert summary["n_aligned"] == summary["n_scans"] == 5
 
 
 # ---- symbols and citations ------------------------------------------------------------------------------------
