@@ -189,17 +189,17 @@ def run_parameters(config: dict, run: Run, notebooks: Path = NOTEBOOKS) -> dict:
     Raises
     ------
     ChapterError
-        If a name is not a parameter of the notebook.
+        If a name is not a parameter of the notebook, or a profile sets the session or method of a run.
     """
     path = notebooks / f"{run.chapter}.ipynb"
     known = notebook_parameters(path)
     common = {key: config[key] for key in SHARED if key in config} | {"in_dir": config["out_dir"]}
-    own = {key: value for key, value in (("session", run.session), ("method", run.method)) if value}
-    own |= (config["notebooks"] or {}).get(run.chapter) or {}
-    unknown = ", ".join(sorted(set(own) - set(known)))
-    if unknown:
-        raise ChapterError(f"{path}: has no parameter {unknown}; it has {', '.join(sorted(known))}")
-    return {key: value for key, value in (common | own).items() if key in known}
+    of_run = {key: value for key, value in (("session", run.session), ("method", run.method)) if value}
+    own = (config["notebooks"] or {}).get(run.chapter) or {}
+    refused = ", ".join(sorted(set(own) - (set(known) - set(of_run)) | set(of_run) - set(known)))
+    if refused:
+        raise ChapterError(f"{path}: a profile cannot set {refused}; parameters: {', '.join(sorted(known))}")
+    return {key: value for key, value in (common | own | of_run).items() if key in known}
 
 
 def translation(config: dict, notebooks: Path = NOTEBOOKS) -> dict[str, str]:

@@ -64,15 +64,17 @@ class Example:
 
 
 def read_examples(page: Path) -> dict[str, Example]:
-    """Read the examples of a page: headings with a module's name, a line of needs, code, and what it prints."""
-    parts = re.split(r"^### \[(\w+)\]\(.*\)\n", page.read_text(encoding="utf-8"), flags=re.MULTILINE)[1:]
-    found = {}
-    for name, text in zip(parts[::2], parts[1::2], strict=True):
-        packages, copied = re.search(r"^Packages: (.*?)\. Also copy: (.*)\.$", text, re.MULTILINE).groups()
-        code = re.search(r"^```python\n(.*?)^```$", text, re.MULTILINE | re.DOTALL)[1]
-        printed = re.search(r"^```text\n(.*?)^```$", text, re.MULTILINE | re.DOTALL)[1]
-        packages = {word for word in packages.split(", ") if word != "none"}
-        found[name] = Example(packages, set(re.findall(r"`(\w+\.py)`", copied)), code, printed)
+    """Read the examples of a page: a table of what modules need; for each a heading, code, and what it prints."""
+    page_text = page.read_text(encoding="utf-8")
+    table = re.findall(r"^\| \[(\w+)\]\(#\1\) \| .+ \| (.+) \| (.+) \|$", page_text, re.MULTILINE)
+    parts = re.split(r"^### \[(\w+)\]\(.*\)\n", page_text, flags=re.MULTILINE)[1:]
+    texts, found = dict(zip(parts[::2], parts[1::2], strict=True)), {}
+    for name, packages, files in table:
+        packages = packages.replace("opencv", "opencv-python-headless")
+        code = re.search(r"^```python\n(.*?)^```$", texts[name], re.MULTILINE | re.DOTALL)[1]
+        printed = re.search(r"^```text\n(.*?)^```$", texts[name], re.MULTILINE | re.DOTALL)[1]
+        needs = {word for word in packages.split(", ") if word != "-"}
+        found[name] = Example(needs, {f"{word}.py" for word in re.findall(r"\w+", files)}, code, printed)
     return found
 
 
@@ -214,19 +216,6 @@ def runtime_imports(node: ast.AST) -> list[tuple[int, str]]:
 # ---- the longer ones ------------------------------------------------------------------------------------------
 
 
-def test_mcl_copied_into_an_empty_folder_localizes(tmp_path: Path) -> None:
-    blocks = dict(code_blocks(TAKE, "Localize in five lines"))
-    assert (
-        "{mcl,compiled,geometry}.py" in blocks["bash"] and "pip install numpy scipy numba" in blocks["bash"]
-    )
-    copy_files(["mcl.py", "compiled.py", "geometry.py"], tmp_path)
-    (tmp_path / "example.py").write_text(blocks["python"], encoding="utf-8")
-    [printed] = run_examples([tmp_path], {"numpy", "scipy", "numba"})
-    assert printed == blocks["text"]
-    mean, worst, by_odometry = map(float, re.findall(r"(\d+\.\d+) m", printed))
-    assert mean < 0.2 and worst < 0.5 < by_odometry
-
-
 def run_with_packages(section: str, folder: Path) -> str:
     """Run the script of a section of the page on radars of one's own, with the packages of `src` at hand."""
     blocks = dict(code_blocks(OWN_RADAR, section))
@@ -245,12 +234,9 @@ def test_radar_of_ones_own_is_localized(tmp_path: Path) -> None:
 
 def test_session_of_ones_own_is_read_as_oxfords_and_aligned(tmp_path: Path) -> None:
     printed = run_with_packages("Write Oxford's files", tmp_path)
-    assert printed.splitlines()[0] == "[]"
     for place in re.findall(r"(\d+\.\d+) m to the left", printed):
         assert abs(float(place) - 20.0) <= 0.25
     pytest.importorskip("papermill")
-    shutil.rmtree(tmp_path / "sessions/my-town/velodyne_right")  # one lidar is enough, as the page says
-    (tmp_path / "sessions/my-town/velodyne_right.timestamps").unlink()
     command = dict(code_blocks(OWN_RADAR, "Write Oxford's files"))["bash"]
     words = shlex.split(command.replace("\\\n", ""))
     (tmp_path / "notebooks").mkdir()
@@ -264,7 +250,7 @@ def test_session_of_ones_own_is_read_as_oxfords_and_aligned(tmp_path: Path) -> N
     summary = json.loads(
         (tmp_path / "build/my-town/alignment/my-town/summary.json").read_text(encoding="utf-8")
     )
-    assert summary["n_aligned"] == summary["n_scans"] == 4
+    assert summary["n_aligned"] == summary["n_scans"] == 5
 
 
 # ---- symbols and citations ------------------------------------------------------------------------------------

@@ -116,16 +116,6 @@ def test_profile_plans_all_jobs(name: str, tmp_path: Path) -> None:
     )  # five sessions to make, their generated images, and the book
 
 
-def test_page_shows_the_profiles_as_they_are() -> None:
-    page = (ROOT / "book/cluster.md").read_text(encoding="utf-8")
-    shown = re.findall(r"```yaml\n(executor:.*?)```", page, flags=re.DOTALL)
-    texts = [
-        (PROFILES / name / "config.yaml").read_text(encoding="utf-8") for name in ("slurm", "kubernetes")
-    ]
-    assert len(shown) == 2
-    assert all(block in text for block, text in zip(shown, texts, strict=True))
-
-
 def test_script_that_tries_slurm_is_a_script() -> None:
     script = ROOT / "workflow/try_slurm.sh"
     assert os.access(script, os.X_OK)
