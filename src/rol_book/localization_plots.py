@@ -16,6 +16,7 @@ from rol.evaluation import CLASSES, PoseErrors
 from rol.geometry import transform_points
 from rol_book import plots
 from rol_book.plots import COLOURS, METHOD_COLOURS
+from rol_book.route_plots import split_figure
 
 FAINT_MAP = "#C8C8C8"
 FAILURE_LINE = {"color": "#444444", "linewidth": 1.2, "linestyle": "--"}
@@ -133,7 +134,7 @@ def draw_update(
     -------
     figure : Figure
     """
-    figure, axes = plots.subplots(1, 3, height=3.4)
+    figure, axes = split_figure(3, 3.4)
     plots.show_poses(axes[0], before, values=counts, length=0.6)
     plots.show_poses(axes[1], moved, colour=COLOURS["radar"], length=0.6).set_alpha(0.35)
     plots.show_poses(axes[1], kept, colour=METHOD_COLOURS["paper"], length=0.6)
