@@ -20,10 +20,11 @@ from rol_study.route_tables import CLASSES, summarize_runs
 PAPER_NAMES = {"02": "seq01", "07": "seq02", "08": "seq03", "10": "seq04"}  # sessions in the paper's tables
 CLASS_NAMES = dict(zip(CLASSES, ("1 m, 2°", "2 m, 5°", "5 m, 10°"), strict=True))
 CAUSE_LABELS = {  # shorter names of `rol_study.route_tables.CAUSES`, for a table
+    "matching distance of 2 m": "d_th of 2 m",
     "all false points last for 10 s": "lasting false points",
     "motion not compensated": "motion uncompensated",
-    "flat weights and motion not compensated": "flat weights, uncompensated",
-    "flat weights and lasting false points": "flat weights, lasting points",
+    "flat weights and motion not compensated": "flat, uncompensated",
+    "flat weights and lasting false points": "flat, lasting points",
 }
 SCAN_HZ = 4.0
 
