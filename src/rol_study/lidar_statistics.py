@@ -293,8 +293,8 @@ def sweep_statistics(sweeps: Sequence[np.ndarray], rng: np.random.Generator, *, 
         the cells of laser and angle in which less than 2 % of the beams return; "steep_returns": fraction of
         beams of the five steepest lasers that return beside the car; "near": fraction of points within 1.9 m;
         "ground": fraction of the other points that are ground; "range_noise_m", "ground_noise_m",
-        "wall_noise_m" [m]; "ground_intensity", "other_intensity": medians; "reach_m": range below which 99.9
-        % of the points lie; "max_range_m"; "histograms" and their "edges".
+        "wall_noise_m" [m]; "reach_m": range below which 99.9 % of the points lie; "histograms" and their
+        "edges".
 
     Raises
     ------
@@ -321,10 +321,7 @@ def sweep_statistics(sweeps: Sequence[np.ndarray], rng: np.random.Generator, *, 
         "near": float(1.0 - is_far.mean()),
         "ground": float(is_ground[is_far].mean()),
         **_mean_noise([sweeps[i] for i in _choose_evenly(np.arange(len(sweeps)), n_noise)], rng),
-        "ground_intensity": float(np.median(points[is_far & is_ground, 3])),
-        "other_intensity": float(np.median(points[is_far & ~is_ground, 3])),
         "reach_m": float(np.percentile(ranges, 99.9)),
-        "max_range_m": float(ranges.max()),
         "histograms": histograms(sweeps),
         "edges": EDGES,
     }
