@@ -365,7 +365,13 @@ def list_jobs(real_root: str) -> dict[str, list[tuple]]:
         "displaced": [(n, q, first, k) for q in COMPARED for n, first, k in wrong_starts],
         "quality": [(number, q, seed) for q in QUALITIES for number in last_first for seed in (1, 2, 3)],
         "causes": [(n, q, seed) for n in last_first[:2] for q in COMPARED for seed in (1, 2, 3)],
-        "settings": list_settings(last_first[:2]),
+        "settings": [
+            (n, what, q, seed)
+            for n in last_first[:2]
+            for what in (SETTINGS if n == first else ["particles"])
+            for q in COMPARED
+            for seed in (1, 2, 3)
+        ],
         "odometry": list_odometry(last_first[:2]),
         "places": list_places(real_root),
         "outliers": [(first, share, seed) for share in (0.015, 0.05) for seed in (1, 2, 3)],
@@ -381,17 +387,6 @@ def list_tuned(numbers: list[str]) -> list[tuple]:
     """List the jobs with tuned settings, without the session that they were tuned on."""
     judged = [number for number in numbers if number != "02"]
     return [(number, what, seed) for number in judged for what in TUNED for seed in (1, 2, 3)]
-
-
-def list_settings(numbers: list[str]) -> list[tuple]:
-    """List the jobs with other settings: the first session, and the number of particles for all."""
-    return [
-        (number, what, quality, seed)
-        for seed in (1, 2, 3)
-        for quality in COMPARED
-        for number in numbers
-        for what in (SETTINGS if number == numbers[0] else ["particles"])
-    ]
 
 
 def list_odometry(numbers: list[str]) -> list[tuple]:
