@@ -37,7 +37,7 @@ CHOICES: dict[str, tuple[Any, ...]] = {  # parameter -> all its values
     "place": ("oxford", "kaist", "dcc", "riverside"),
     "points_source": ("raw", "fake", "real", "fake-corrected"),
 }
-MAY_BE_ZERO = ("seed", "twin_seed", "scan_number", "kidnapped_at", "gap_scans", "steps", "n_blocks")
+MAY_BE_ZERO = ("seed", "counterpart_seed", "scan_number", "kidnapped_at", "gap_scans", "steps", "n_blocks")
 NETWORKS = ("network", "compared", "networks")  # parameters that name networks
 
 

@@ -127,7 +127,7 @@ def draw_settings(swept: pd.DataFrame, printed: Mapping[str, float]) -> Figure:
         column[1].set_xlabel(names.get(what, what))
     axes[0, 0].set_ylabel("RMSE [m]")
     axes[1, 0].set_ylabel("within 1 m, 2° [%]")
-    axes[0, 0].legend(title="within 1 m", loc="center left")
+    axes[0, -1].legend(title="within 1 m", loc="center")
     return figure
 
 

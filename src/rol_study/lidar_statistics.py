@@ -293,8 +293,8 @@ def sweep_statistics(sweeps: Sequence[np.ndarray], rng: np.random.Generator, *, 
         the cells of laser and angle in which less than 2 % of the beams return; "steep_returns": fraction of
         beams of the five steepest lasers that return beside the car; "near": fraction of points within 1.9 m;
         "ground": fraction of the other points that are ground; "range_noise_m", "ground_noise_m",
-        "wall_noise_m" [m]; "ground_intensity", "other_intensity": medians; "reach_m": range below which 99.9
-        % of the points lie; "max_range_m"; "histograms" and their "edges".
+        "wall_noise_m" [m]; "reach_m": range below which 99.9 % of the points lie; "histograms" and their
+        "edges".
 
     Raises
     ------
@@ -321,10 +321,7 @@ def sweep_statistics(sweeps: Sequence[np.ndarray], rng: np.random.Generator, *, 
         "near": float(1.0 - is_far.mean()),
         "ground": float(is_ground[is_far].mean()),
         **_mean_noise([sweeps[i] for i in _choose_evenly(np.arange(len(sweeps)), n_noise)], rng),
-        "ground_intensity": float(np.median(points[is_far & is_ground, 3])),
-        "other_intensity": float(np.median(points[is_far & ~is_ground, 3])),
         "reach_m": float(np.percentile(ranges, 99.9)),
-        "max_range_m": float(ranges.max()),
         "histograms": histograms(sweeps),
         "edges": EDGES,
     }
@@ -399,15 +396,15 @@ def summarize_sweeps(statistics: dict) -> dict[str, float]:
         "sweeps": statistics["sweeps"],
         "points per sweep, median": np.median(statistics["points"]),
         "angle between firings [deg]": statistics["step_deg"],
-        "beams without a return beyond the car [%]": 100.0 * statistics["no_return"],
-        "cells of laser and angle that never return [%]": 100.0 * statistics["blocked"],
-        "steepest lasers beside the car: beams that return [%]": 100.0 * statistics["steep_returns"],
-        "noise of a range along scan lines [mm]": 1e3 * statistics["range_noise_m"],
+        "beams without a return [%]": 100.0 * statistics["no_return"],
+        "directions that never return [%]": 100.0 * statistics["blocked"],
+        "beams beside the vehicle that return [%]": 100.0 * statistics["steep_returns"],
+        "noise of a range [mm]": 1e3 * statistics["range_noise_m"],
         "residual to planes, ground [mm]": 1e3 * statistics["ground_noise_m"],
         "residual to planes, walls [mm]": 1e3 * statistics["wall_noise_m"],
         f"points within {NEAR_M} m [%]": 100.0 * statistics["near"],
         "ground, of the other points [%]": 100.0 * statistics["ground"],
-        "range that 99.9 % do not exceed [m]": statistics["reach_m"],
+        "range not exceeded by 99.9 % [m]": statistics["reach_m"],
         **{f"Hellinger distance of {name}": distance for name, distance in statistics["distances"].items()},
     }
 

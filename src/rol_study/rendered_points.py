@@ -23,7 +23,11 @@ from rol_data import rall
 from rol_sim.session.settings import parse_settings
 from rol_sim.session.simulation import SimulatedSession, build_session, make_scan
 
-STREET = {"parked_share": 0.15, "vehicles": 10, "people": 6}  # as for the simulated twins of the real scans
+STREET = {
+    "parked_share": 0.15,
+    "vehicles": 10,
+    "people": 6,
+}  # as for the simulated counterparts of the real scans
 
 
 def build_segment(

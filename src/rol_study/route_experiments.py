@@ -14,7 +14,7 @@ from time import perf_counter
 
 import numpy as np
 
-from rol.evaluation import FailureMonitor, FailureRule
+from rol.evaluation import FailureMonitor, FailureRule, pose_errors
 from rol.geometry import compose, relative_pose
 from rol.mcl import MapGrid, MclSettings, ParticleFilter, localize
 from rol.radar import ScanMotion, compensate_points
@@ -343,6 +343,14 @@ class RecoveryTrial:
     seconds: float
 
 
+def first_lasting(is_right: np.ndarray, n_stay: int = 8) -> float:
+    """Find the time from which on an array of bool, one per scan, is true for `n_stay` scans [s];
+    infinite if it never is."""
+    is_long = len(is_right) >= n_stay
+    stays = np.convolve(is_right, np.ones(n_stay), "valid") > n_stay - 0.5 if is_long else np.zeros(1)
+    return float(np.argmax(stays) * SCAN_US * 1e-6) if stays.any() else float("inf")
+
+
 def evaluate_recovery(
     updates: Sequence[RecoveryUpdate],
     truth: np.ndarray,
@@ -375,11 +383,9 @@ def evaluate_recovery(
     distance = np.hypot(off[:, 0], off[:, 1])
     is_right = (distance < limits[0]) & (np.abs(off[:, 2]) < limits[1])
     is_lost = np.array([update.is_lost for update in updates])
-    is_long = len(poses) >= n_stay
-    stays = np.convolve(is_right, np.ones(n_stay), "valid") > n_stay - 0.5 if is_long else np.zeros(1)
     wrong = ~is_right[n_stay:]
     return RecoveryTrial(
-        found_s=float(np.argmax(stays) * SCAN_US * 1e-6) if stays.any() else float("inf"),
+        found_s=first_lasting(is_right, n_stay),
         told_share=float(is_lost[n_stay:][wrong].mean()) if wrong.any() else float("nan"),
         error_m=float(distance[-1]),
         is_lost_at_end=bool(is_lost[-1]),
@@ -389,27 +395,19 @@ def evaluate_recovery(
 
 
 def run_from(
-    experiment: RouteExperiment,
-    first: int,
-    start: np.ndarray,
-    n_scans: int,
-    seed: int,
-    *,
-    is_start_known: bool,
+    experiment: RouteExperiment, start: np.ndarray, rng: np.random.Generator, *, is_start_known: bool
 ) -> tuple[list[RecoveryUpdate], list[np.ndarray]]:
-    """Run the method `robust` from a given scan on, starting at a pose that is not the true one.
+    """Run the method `robust` from a pose that is not the true one.
 
     Parameters
     ----------
     experiment : RouteExperiment
-        Session, map and calibration.
-    first, n_scans : int
-        First scan, and the largest number of scans; a run from an unknown start ends two seconds after the
-        filter has reported that it is not lost.
+        Scans, map and calibration. A run from an unknown start ends two seconds after the filter has reported
+        that it is not lost.
     start : array, shape (3,)
         Start pose given to the filter [m, m, rad].
-    seed : int
-        Of points and particles.
+    rng : numpy.random.Generator
+        Random generator of points and particles.
     is_start_known : bool
         False: the filter treats the start only as the centre of the search.
 
@@ -419,18 +417,9 @@ def run_from(
         One per scan.
     clouds : list of array, shape (m, 2)
         Their points [m].
-
-    Raises
-    ------
-    ValueError
-        If the session has no such first scan.
     """
-    _check_first(experiment, first)
-    e, poses = experiment, experiment.session.truth[first : first + n_scans]
-    rng, starts = np.random.default_rng([seed, first]), e.visible.starts[first : first + len(poses) + 1]
-    visible = VisiblePoints(e.visible.points[starts[0] : starts[-1]], starts - starts[0])
-    sampling = sample_points(e.map_points, poses, visible, e.front_end, rng, e.parts)
-    updates, clouds, n_found = [], [], 0
+    e, updates, clouds, n_found = experiment, [], [], 0
+    sampling = sample_points(e.map_points, e.session.truth, e.visible, e.front_end, rng, e.parts)
 
     def keep_clouds() -> Iterator[np.ndarray]:
         for cloud in sampling:
@@ -439,8 +428,7 @@ def run_from(
 
     settings, recovery = settings_for("robust", motion=e.motion), RecoverySettings(e.reference_contrast)
     robust_filter = RecoveringFilter(e.map_points, start, settings, recovery, rng, is_start_known, e.grid)
-    increments = gate_odometry(e.session.increments[first:])
-    for update in localize(robust_filter, increments, keep_clouds()):
+    for update in localize(robust_filter, gate_odometry(e.session.increments), keep_clouds()):
         updates.append(update)
         n_found = 0 if update.is_lost else n_found + 1
         if not is_start_known and n_found > 8:
@@ -448,11 +436,48 @@ def run_from(
     return updates, clouds
 
 
-def _check_first(experiment: RouteExperiment, first: int) -> None:
-    """Raise for a first scan that the session does not have; a negative one would count from its end."""
-    number, n_scans = experiment.session.number, len(experiment.session.truth)
-    if not 0 <= first < n_scans:
-        raise ValueError(f"first: {first} is no scan of session {number}, which has {n_scans}")
+def cut_scans(experiment: RouteExperiment, first: int, n_scans: int) -> RouteExperiment:
+    """Cut at most `n_scans` scans out of a session, with the points visible from them.
+
+    Raises
+    ------
+    ValueError
+        If the session has no such first scan; a negative one would count from its end.
+    """
+    session, visible = experiment.session, experiment.visible
+    n = len(session.truth)
+    if not 0 <= first < n:
+        raise ValueError(f"first: {first} is no scan of session {session.number}, which has {n}")
+    starts = visible.starts[first : first + n_scans + 1]
+    visible = VisiblePoints(visible.points[starts[0] : starts[-1]], starts - starts[0])
+    return replace(experiment, session=session.part(first, first + n_scans), visible=visible)
+
+
+def run_displaced(
+    experiment: RouteExperiment, start: np.ndarray, clouds: Iterable[np.ndarray], seed: int
+) -> np.ndarray:
+    """Run the method `paper` without resets from a pose that is not the true one.
+
+    Parameters
+    ----------
+    experiment : RouteExperiment
+        Session, and the grid of the method `paper`.
+    start : array, shape (3,)
+        Start pose given to the filter [m, m, rad].
+    clouds : iterable of array, shape (m, 2)
+        Points of each scan [m].
+    seed : int
+        Of the particles.
+
+    Returns
+    -------
+    errors_m : array, shape (n,)
+        Position errors [m].
+    """
+    session, rng = experiment.session, np.random.default_rng([seed, int(experiment.session.number), 1])
+    particle_filter = ParticleFilter(experiment.grid, start, settings_for("paper", cell_m=CELL_M), rng)
+    poses = [update.pose for update in localize(particle_filter, session.increments, clouds)]
+    return pose_errors(np.array(poses), session.truth).position_m
 
 
 def kidnap(
@@ -483,10 +508,10 @@ def kidnap(
     ValueError
         If the session has no such first scan.
     """
-    _check_first(experiment, first)
-    truth, rng = experiment.session.truth[first:], np.random.default_rng([seed, first, 2])
-    start, begin = displace(truth[0], 20.0, np.deg2rad(20.0), rng), perf_counter()
-    updates, clouds = run_from(experiment, first, start, n_scans, seed, is_start_known=True)
+    part, begin = cut_scans(experiment, first, n_scans), perf_counter()
+    truth, rng = part.session.truth, np.random.default_rng([seed, first, 2])
+    start = displace(truth[0], 20.0, np.deg2rad(20.0), rng)
+    updates, clouds = run_from(part, start, np.random.default_rng([seed, first]), is_start_known=True)
     return evaluate_recovery(updates, truth, perf_counter() - begin), updates, clouds
 
 
@@ -520,12 +545,11 @@ def localize_globally(
     ValueError
         If the session has no such first scan.
     """
-    _check_first(experiment, first)
-    truth, rng = experiment.session.truth[first:], np.random.default_rng([seed, first, 3])
+    part, begin = cut_scans(experiment, first, n_scans), perf_counter()
+    truth, rng = part.session.truth, np.random.default_rng([seed, first, 3])
     start = displace(truth[0], within_m * np.sqrt(rng.random()), 0.0, rng)
     start[2] = rng.uniform(-np.pi, np.pi)
-    begin = perf_counter()
-    updates, clouds = run_from(experiment, first, start, n_scans, seed, is_start_known=False)
+    updates, clouds = run_from(part, start, np.random.default_rng([seed, first]), is_start_known=False)
     return evaluate_recovery(updates, truth, perf_counter() - begin), updates, clouds
 
 

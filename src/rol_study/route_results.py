@@ -19,6 +19,13 @@ from rol_study.route_tables import CLASSES, summarize_runs
 
 PAPER_NAMES = {"02": "seq01", "07": "seq02", "08": "seq03", "10": "seq04"}  # sessions in the paper's tables
 CLASS_NAMES = dict(zip(CLASSES, ("1 m, 2°", "2 m, 5°", "5 m, 10°"), strict=True))
+CAUSE_LABELS = {  # shorter names of `rol_study.route_tables.CAUSES`, for a table
+    "matching distance of 2 m": "d_th of 2 m",
+    "all false points last for 10 s": "lasting false points",
+    "motion not compensated": "motion uncompensated",
+    "flat weights and motion not compensated": "flat, uncompensated",
+    "flat weights and lasting false points": "flat, lasting points",
+}
 SCAN_HZ = 4.0
 
 
@@ -110,15 +117,15 @@ def cause_table(causes: pd.DataFrame, paper2: pd.DataFrame, paper3: pd.DataFrame
     Returns
     -------
     table : pandas.DataFrame
-        One row per cause, columns in two levels: quality, and RMSE [m], classes [%] and failures per run.
+        One row per cause, columns in two levels: quality, and RMSE [m], two classes [%] and failures per run.
     """
-    names = {"rmse_m": "RMSE [m]"} | {name: f"{w} [%]" for name, w in CLASS_NAMES.items()}
+    names = {"rmse_m": "RMSE [m]", "within_1m_2deg": "1 m, 2° [%]", "within_5m_10deg": "5 m, 10° [%]"}
     names |= {"failures": "failures"}
     wide = summarize_runs(causes, ["cause", "fraction_1m"])[list(names)].unstack("fraction_1m")
     wide = wide.swaplevel(axis=1).sort_index(axis=1, level=0, sort_remaining=False)
-    wide = wide.loc[list(dict.fromkeys(causes.cause))]
-    printed = [paper2.rmse_m.mean(), *(100 * paper3[list(CLASSES)].mean()), paper2.failures.mean()]
-    wide.loc["the paper (mean)"] = printed * (len(wide.columns) // len(printed))
+    wide = wide.loc[list(dict.fromkeys(causes.cause))].rename(index=CAUSE_LABELS)
+    means = paper2.join(100 * paper3[list(CLASSES)]).mean()
+    wide.loc["the paper (mean)"] = [means[name] for _, name in wide.columns]
     wide = wide.rename(columns=names, level=1).rename(columns=lambda q: f"{100 * q:.0f} %", level=0)
     return wide.rename_axis(None).rename_axis(columns=[None, None])
 
@@ -247,6 +254,11 @@ def fraction_by_chance(
     return float(np.mean(cKDTree(map_points).query(places)[0] < within_m))
 
 
+def _name_filters(places: pd.DataFrame) -> pd.Series:
+    """Name the filters at other places: "paper", "robust" and, where it is calibrated on Oxford, "oxford"."""
+    return places.method.where(~places.calibrated_on.str.startswith("oxford"), "oxford")
+
+
 def place_table(places: pd.DataFrame) -> pd.DataFrame:
     """Average the runs at other places over the seeds.
 
@@ -257,10 +269,13 @@ def place_table(places: pd.DataFrame) -> pd.DataFrame:
 
     Returns
     -------
-    groups : pandas.DataFrame
-        From `summarize_runs`, indexed by place, session, fraction_1m, method and calibrated_on.
+    table : pandas.DataFrame
+        Indexed by place, session and fraction_1m; columns in two levels: ``rmse_m`` [m] or ``rmse_yaw_deg``
+        [deg], and the filters of `place_numbers`.
     """
-    return summarize_runs(places, ["place", "session", "fraction_1m", "method", "calibrated_on"])
+    by = [places.place, places.session, places.fraction_1m, _name_filters(places)]
+    table = places[["rmse_m", "rmse_yaw_deg"]].groupby(by).mean().unstack()
+    return table.reindex(columns=["paper", "robust", "oxford"], level=1)
 
 
 def place_numbers(places: pd.DataFrame) -> dict[str, float]:
@@ -279,8 +294,7 @@ def place_numbers(places: pd.DataFrame) -> dict[str, float]:
         `robust` calibrated on Oxford). ``places_runs`` and ``places_sessions`` count runs of each filter and
         sessions, ``places_failures`` those of all runs.
     """
-    is_oxford = places.calibrated_on.str.startswith("oxford")
-    filters = places.method.where(~is_oxford, "oxford")
+    filters = _name_filters(places)
     numbers = {
         "places_runs": int((filters == "paper").sum()),
         "places_sessions": int(places.groupby(["place", "session"]).ngroups),
@@ -320,6 +334,24 @@ def peer_table(tuned: pd.DataFrame, registered: pd.DataFrame, runs: pd.DataFrame
     is_peer = peers.seed.isin({*tuned.seed} & {*registered.seed}) & peers.session.isin(tuned.session)
     groups = summarize_runs(peers[is_peer], ["filter"])
     return groups.sort_values("rmse_m", ascending=False, kind="stable")
+
+
+def displaced_table(trials: pd.DataFrame) -> pd.DataFrame:
+    """Count the displaced starts from which the error of the method `paper` shrank again.
+
+    Parameters
+    ----------
+    trials : pandas.DataFrame
+        The stored table "displaced".
+
+    Returns
+    -------
+    table : pandas.DataFrame
+        Indexed by distance_m and turn_deg, one column per fraction_1m: starts from which the position error
+        fell below 2 m [%].
+    """
+    by = [trials.distance_m, trials.turn_deg, trials.fraction_1m]
+    return 100.0 * np.isfinite(trials.below_2m_s).groupby(by).mean().unstack()
 
 
 def trial_numbers(trials: pd.DataFrame, within_s: float) -> dict[str, float]:

@@ -30,12 +30,17 @@ from rol_study.filter_runs import FilterRun
 from rol_study.oxford_route import list_sessions, published_motion, published_reference_contrast
 from rol_study.rendered_points import build_segment, render_points
 from rol_study.route_experiments import (
+    CELL_M,
     RouteExperiment,
     add_outliers,
     change_front_end,
+    cut_scans,
+    displace,
+    first_lasting,
     kidnap,
     localize_globally,
     prepare_experiment,
+    run_displaced,
     run_method,
     sample_session,
     skew_by_motion,
@@ -91,6 +96,8 @@ RECOVERIES = {
     "standing scans count in full": {"stationary_weight": 1.0},
 }
 INGREDIENTS |= {name: {} for name in (*RECOVERIES, UNCALIBRATED)}
+# Wrong starts of the method `paper`: distance [m] and turn [deg]. The last is that of the table "kidnapped".
+DISPLACEMENTS = ((5.0, 5.0), (10.0, 5.0), (20.0, 5.0), (20.0, 20.0))
 NARROW = {"d_th_m": 0.25}  # the best of the first sweep on session 02, whose ends these were
 QUIET = {"forward_m": 0.1, "left_m": 0.06, "yaw_rad": 0.2 * DEG}
 TUNED = {"both": NARROW | QUIET, "d_th of 0.25 m": NARROW, "a fifth of the noise": QUIET}
@@ -160,34 +167,31 @@ def measure(real_root: str, weights: str, what: str, key: tuple) -> list[dict]:
     return [{"job": " ".join(map(str, key)), **row} for row in MEASURES[what](real_root, *key, **own)]
 
 
+def run_both(experiment: RouteExperiment, clouds: list[np.ndarray], seed: int, **about: object) -> list[dict]:
+    """Run both methods on the same points; each row begins with the columns `about`."""
+    return [
+        about | row_of(experiment, run_method(experiment, method, clouds, seed), method, seed)
+        for method in ("paper", "robust")
+    ]
+
+
 def measure_seeds(real_root: str, number: str, seed: int) -> list[dict]:
     """Run both methods over a whole session."""
     experiment = experiment_of(real_root, number)
-    clouds = sample_session(experiment, seed)
-    return [
-        row_of(experiment, run_method(experiment, method, clouds, seed), method, seed)
-        for method in ("paper", "robust")
-    ]
+    return run_both(experiment, sample_session(experiment, seed), seed)
 
 
 def measure_quality(real_root: str, number: str, fraction_1m: float, seed: int) -> list[dict]:
     """Run both methods over a whole session with points of another quality."""
     experiment = experiment_of(real_root, number, front_end_of(fraction_1m))
-    clouds, about = sample_session(experiment, seed), {"fraction_1m": fraction_1m}
-    return [
-        about | row_of(experiment, run_method(experiment, method, clouds, seed), method, seed)
-        for method in ("paper", "robust")
-    ]
+    return run_both(experiment, sample_session(experiment, seed), seed, fraction_1m=fraction_1m)
 
 
 def measure_odometry(real_root: str, number: str, odometry: str, fraction_1m: float, seed: int) -> list[dict]:
     """Run both methods over a whole session with another odometry, each calibrated on it."""
     experiment = experiment_of(real_root, number, front_end_of(fraction_1m), odometry=odometry)
-    clouds, about = sample_session(experiment, seed), {"odometry": odometry, "fraction_1m": fraction_1m}
-    return [
-        about | row_of(experiment, run_method(experiment, method, clouds, seed), method, seed)
-        for method in ("paper", "robust")
-    ]
+    about = {"odometry": odometry, "fraction_1m": fraction_1m}
+    return run_both(experiment, sample_session(experiment, seed), seed, **about)
 
 
 def measure_places(
@@ -226,18 +230,17 @@ def measure_causes(real_root: str, number: str, fraction_1m: float, seed: int) -
     return rows
 
 
-def measure_settings(real_root: str, number: str, fraction_1m: float, seed: int) -> list[dict]:
-    """Run the method `paper` with one setting after the other changed."""
+def measure_settings(real_root: str, number: str, what: str, fraction_1m: float, seed: int) -> list[dict]:
+    """Run the method `paper` with each value of a setting."""
     experiment, rows = experiment_of(real_root, number, front_end_of(fraction_1m), SHORT), []
     clouds = sample_session(experiment, seed)
-    for name, values in SETTINGS.items():
-        for setting, value in values:
-            changes = {setting: value}
-            if setting == "noise":
-                changes = {"forward_m": 0.5 * value, "left_m": 0.3 * value, "yaw_rad": value * DEG}
-            run = run_method(experiment, "paper", clouds, seed, **changes)
-            about = {"what": name, "value": value, "fraction_1m": fraction_1m}
-            rows.append(about | row_of(experiment, run, "paper", seed))
+    for setting, value in SETTINGS[what]:
+        changes = {setting: value}
+        if setting == "noise":
+            changes = {"forward_m": 0.5 * value, "left_m": 0.3 * value, "yaw_rad": value * DEG}
+        run = run_method(experiment, "paper", clouds, seed, **changes)
+        about = {"what": what, "value": value, "fraction_1m": fraction_1m}
+        rows.append(about | row_of(experiment, run, "paper", seed))
     return rows
 
 
@@ -272,14 +275,9 @@ def measure_registration(real_root: str, number: str, seed: int) -> list[dict]:
 def measure_outliers(real_root: str, number: str, share: float, seed: int) -> list[dict]:
     """Run both methods with outliers in the odometry."""
     experiment = experiment_of(real_root, number, None, SHORT)
-    disturbed = replace(
-        experiment, session=add_outliers(experiment.session, share, np.random.default_rng(seed))
-    )
+    session = add_outliers(experiment.session, share, np.random.default_rng(seed))
     clouds = sample_session(experiment, seed)
-    return [
-        {"share": share} | row_of(disturbed, run_method(disturbed, m, clouds, seed), m, seed)
-        for m in ("paper", "robust")
-    ]
+    return run_both(replace(experiment, session=session), clouds, seed, share=share)
 
 
 def measure_rendered(
@@ -291,10 +289,7 @@ def measure_rendered(
     experiment = experiment_of(real_root, number, FrontEnd(0.80, 0.88))
     simulated = build_segment(real_root, number, first, n_scans, seed)
     clouds = list(render_points(simulated, load_network(weights)))
-    part = replace(experiment, session=experiment.session.part(first, first + n_scans))
-    return [
-        row_of(part, run_method(part, method, clouds, seed), method, seed) for method in ("paper", "robust")
-    ]
+    return run_both(cut_scans(experiment, first, n_scans), clouds, seed)
 
 
 def measure_trial(what: str):
@@ -307,6 +302,24 @@ def measure_trial(what: str):
         return [{"session": number, "first": first, "seed": seed, **vars(found)}]
 
     return trial
+
+
+def measure_displaced(real_root: str, number: str, fraction_1m: float, first: int, seed: int) -> list[dict]:
+    """Run the method `paper` from wrong poses for a minute; a row has the times from which on the position
+    error is below 5 m and 2 m for two seconds."""
+    front_end, settings = front_end_of(fraction_1m), settings_for("paper", cell_m=CELL_M)
+    experiment = cut_scans(experiment_of(real_root, number, front_end, settings=settings), first, 240)
+    clouds, rows = sample_session(experiment, seed), []
+    for distance_m, turn_deg in DISPLACEMENTS:
+        rng = np.random.default_rng([seed, first, 2])
+        start = displace(experiment.session.truth[0], distance_m, np.deg2rad(turn_deg), rng)
+        errors_m = run_displaced(experiment, start, clouds, seed)
+        rows.append({
+            "session": number, "first": first, "seed": seed, "fraction_1m": fraction_1m,
+            "distance_m": distance_m, "turn_deg": turn_deg, "below_5m_s": first_lasting(errors_m < 5.0),
+            "below_2m_s": first_lasting(errors_m < 2.0), "error_m": errors_m[-1],
+        })  # fmt: skip
+    return rows
 
 
 MEASURES = {
@@ -322,6 +335,7 @@ MEASURES = {
     "outliers": measure_outliers,
     "rendered": measure_rendered,
     "kidnapped": measure_trial("kidnapped"),
+    "displaced": measure_displaced,
     "anywhere": measure_trial("anywhere"),
 }
 
@@ -341,14 +355,21 @@ def list_jobs(real_root: str) -> dict[str, list[tuple]]:
             (name, int(rng.integers(100, lengths[name] - 4 * seconds)), k) for k, name in enumerate(picked)
         )
 
-    first = driven[0]
+    first, wrong_starts = driven[0], places(100, 15)
     last_first = sorted(driven, key=lambda number: (number not in (first, driven[-1]), number))
     return {
         "seeds": [(number, seed) for seed in range(1, 11) for number in ours],
-        "kidnapped": places(100, 15),
+        "kidnapped": wrong_starts,
+        "displaced": [(n, q, first, k) for q in COMPARED for n, first, k in wrong_starts],
         "quality": [(number, q, seed) for q in QUALITIES for number in last_first for seed in (1, 2, 3)],
         "causes": [(n, q, seed) for n in last_first[:2] for q in COMPARED for seed in (1, 2, 3)],
-        "settings": [(first, quality, seed) for quality in COMPARED for seed in (1, 2, 3)],
+        "settings": [
+            (n, what, q, seed)
+            for n in last_first[:2]
+            for what in (SETTINGS if n == first else ["particles"])
+            for q in COMPARED
+            for seed in (1, 2, 3)
+        ],
         "odometry": list_odometry(last_first[:2]),
         "places": list_places(real_root),
         "outliers": [(first, share, seed) for share in (0.015, 0.05) for seed in (1, 2, 3)],

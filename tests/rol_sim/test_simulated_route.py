@@ -20,7 +20,7 @@ from rol_data import rall
 from rol_sim.drive import recorded_poses
 from rol_sim.session import writer
 from rol_sim.session.settings import SettingsError, load_settings, parse_settings
-from rol_sim.session.simulation import build_session, build_twins, make_scan
+from rol_sim.session.simulation import build_counterparts, build_session, make_scan
 from rol_sim.world import mapped
 from rol_sim.world.mesh import Material
 
@@ -291,11 +291,11 @@ def test_route_without_real_data_says_how_to_get_them(tmp_path: Path) -> None:
         parse_settings({"sessions": {"sim-a": {"start": START, "scans": 0}}})
 
 
-def test_twins_stand_where_the_real_scans_stood(real_root: Path) -> None:
-    twins = build_twins(real_root, seed=2)
+def test_counterparts_stand_where_the_real_scans_stood(real_root: Path) -> None:
+    counterparts = build_counterparts(real_root, seed=2)
     known = rall.load_scan_poses(rall.find_scan_poses(real_root))
-    np.testing.assert_array_equal(twins.scans_us, list(known))
+    np.testing.assert_array_equal(counterparts.scans_us, list(known))
     np.testing.assert_allclose(
-        twins.trajectory.pose(twins.scans_us + 125_000), list(known.values()), atol=1e-4
+        counterparts.trajectory.pose(counterparts.scans_us + 125_000), list(known.values()), atol=1e-4
     )
-    assert make_scan(twins, 0).stamp_us == twins.scans_us[0]
+    assert make_scan(counterparts, 0).stamp_us == counterparts.scans_us[0]

@@ -31,16 +31,19 @@ from rol_study.route_experiments import (
     RouteExperiment,
     add_outliers,
     change_front_end,
+    cut_scans,
     displace,
     evaluate_recovery,
+    first_lasting,
     kidnap,
     localize_globally,
     prepare_experiment,
+    run_displaced,
     run_method,
     sample_session,
     skew_by_motion,
 )
-from rol_study.sampled_points import FrontEnd, SampledPointsError
+from rol_study.sampled_points import FrontEnd, SampledPointsError, VisiblePoints
 
 MAP = np.array([[0.0, 0.0], [100.0, 100.0]])
 MAP_ALL = np.array([[-2000.0, -2000.0], [2000.0, 2000.0]])  # holds any route
@@ -344,6 +347,31 @@ def test_recovery_is_evaluated_by_the_first_estimate_that_stays_right() -> None:
     assert trial.error_m == 0.5 and not trial.is_lost_at_end and trial.n_particles == 7
     never = evaluate_recovery([Reported(wrong, True)] * 40, truth)
     assert never.found_s == np.inf and never.told_share == 1.0
+
+
+def test_an_estimate_must_stay_right() -> None:
+    assert first_lasting(np.arange(20) >= 6) == 1.5 and first_lasting(np.arange(20) >= 13) == np.inf
+    assert first_lasting(np.ones(7, dtype=bool)) == np.inf
+
+
+def test_scans_are_cut_with_what_is_visible_from_them(street: tuple) -> None:
+    route, posts, _ = street
+    visible = VisiblePoints(np.arange(80).reshape(40, 2), np.arange(41))
+    others = FrontEnd(), visible, route.truth, route.truth, None, MotionModel(), "", 0.2, None
+    part = cut_scans(RouteExperiment(route, posts, *others), 35, 100)
+    np.testing.assert_array_equal(part.session.truth, route.truth[35:])
+    np.testing.assert_allclose([part.visible[k][0, 0] for k in range(5)], 0.02 * np.arange(35, 40))
+
+
+def test_the_papers_filter_returns_from_a_near_start_only(street: tuple) -> None:
+    route, posts, clouds = street
+    grid = settings_for("paper", cell_m=0.25).measurement.build_grid(posts)
+    others = FrontEnd(), None, route.truth, route.truth, None, MotionModel(), "", 0.2, grid
+    experiment = RouteExperiment(route, posts, *others)
+    near, far = (
+        run_displaced(experiment, route.truth[0] + (off_m, 0.0, 0.0), clouds, 1) for off_m in (-2.0, -200.0)
+    )
+    assert near[0] > 1.0 and near[-1] < 0.5 and far.min() > 100.0  # no reset
 
 
 def test_displaced_poses_are_as_far_off_as_asked() -> None:

@@ -63,6 +63,7 @@ def test_causes_keep_their_order_and_end_with_the_paper() -> None:
     assert table.index.tolist() == ["b", "a", "the paper (mean)"]
     assert table["50 %"]["RMSE [m]"].tolist() == [3.0, 4.0, 8.46]
     assert table["40 %"]["failures"].tolist() == [1.0, 1.0, 2.0]
+    assert table["40 %"]["1 m, 2° [%]"].tolist() == [50.0, 50.0, 30.0]
 
 
 def test_odometries_are_compared_on_the_same_runs() -> None:
@@ -129,7 +130,17 @@ def test_places_compare_the_calibrations() -> None:
     assert numbers["dcc_47_robust_m"] == 0.1 and numbers["dcc_47_paper_failures"] == 1
     assert numbers["dcc_47_oxford_m"] == pytest.approx(0.3) and numbers["dcc_47_oxford_worst_m"] == 0.4
     assert [numbers[f"places_{name}"] for name in ("runs", "sessions", "failures")] == [1, 1, 4]
-    assert len(results.place_table(runs)) == 3
+    table = results.place_table(runs)
+    assert table["rmse_m"].loc[("dcc", "02", 0.47)].to_list() == pytest.approx([0.4, 0.1, 0.3])
+
+
+def test_displaced_starts_are_counted() -> None:
+    trials = pd.DataFrame({
+        "distance_m": [5.0] * 3 + [20.0], "turn_deg": 5.0, "fraction_1m": [0.40, 0.40, 0.47, 0.40],
+        "below_2m_s": [3.0, np.inf, 0.0, np.inf],
+    })  # fmt: skip
+    table = results.displaced_table(trials)
+    assert table.loc[(5.0, 5.0)].to_list() == [50.0, 100.0] and table.loc[(20.0, 5.0), 0.40] == 0.0
 
 
 def test_peers_share_sessions_and_seeds() -> None:

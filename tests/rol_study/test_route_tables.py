@@ -164,9 +164,30 @@ def test_a_row_is_also_judged_without_scans_of_faulty_ground_truth(asked: list) 
     assert (row["n_faulty"], row["rmse_sound_m"]) == (3, 0.0) and row["rmse_m"] > 1.0
 
 
+def test_displaced_starts_share_their_points_and_directions(
+    asked: list, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    starts = []
+
+    def run(experiment, start, clouds, seed) -> np.ndarray:
+        starts.append(start - experiment.session.truth[0])
+        return np.linspace(9.0, 0.0, 31)
+
+    monkeypatch.setattr(route_tables, "run_displaced", run)
+    monkeypatch.setattr(route_tables, "cut_scans", lambda experiment, first, n_scans: experiment)
+    rows = route_tables.measure_displaced("", "07", 0.4, 12, 3)
+    assert [(row["distance_m"], row["turn_deg"]) for row in rows] == list(route_tables.DISPLACEMENTS)
+    np.testing.assert_allclose(np.hypot(*np.array(starts)[:, :2].T), [5.0, 10.0, 20.0, 20.0])
+    np.testing.assert_allclose(np.abs(np.rad2deg(starts))[:, 2], [5.0, 5.0, 5.0, 20.0])
+    assert np.ptp(np.arctan2(*np.array(starts)[:, :2].T)) < 1e-9
+    assert (rows[0]["below_5m_s"], rows[0]["below_2m_s"], rows[0]["error_m"]) == (3.5, np.inf, 0.0)
+
+
 def test_settings_are_swept_past_the_best_of_the_first_sweep(asked: list) -> None:
-    rows = route_tables.measure_settings("", "07", 0.4, 1)
-    swept = {name: [row["value"] for row in rows if row["what"] == name] for name in route_tables.SETTINGS}
+    swept = {
+        name: [row["value"] for row in route_tables.measure_settings("", "07", name, 0.4, 1)]
+        for name in route_tables.SETTINGS
+    }
     assert min(swept["d_th [m]"]) < 0.25 and min(swept["noise"]) < 0.2 and max(swept["lambda"]) > 80
     assert asked[-1].changes == pytest.approx({"forward_m": 1.0, "left_m": 0.6, "yaw_rad": np.deg2rad(2.0)})
 

@@ -8,7 +8,7 @@ import pytest
 from rol.oxford import load_radar
 from rol_data import rall
 from rol_sim.sensors.radar_signal import echoes_to_codes, range_to_bins
-from rol_sim.session.simulation import build_twins, make_scan
+from rol_sim.session.simulation import build_counterparts, make_scan
 from rol_study import radar_statistics as statistics
 from rol_study import two_sample_classifier
 
@@ -129,12 +129,12 @@ def test_classifier_tells_what_differs_and_nothing_else() -> None:
         two_sample_classifier.train_classifier(one, louder[:1], rng)
 
 
-def test_twins_have_the_statistics_of_the_real_scans(real_root: Path) -> None:
+def test_counterparts_have_the_statistics_of_the_real_scans(real_root: Path) -> None:
     """The calibration itself: targets that simulated scans must meet, on a seed that it was not set with."""
     known = rall.load_scan_poses(rall.find_scan_poses(real_root))
     real = np.stack([load_radar(real_root / rall.SCANS_PATH / "radar" / f"{us}.png").power for us in known])
-    twins = build_twins(real_root, seed=11)
-    codes = np.stack([make_scan(twins, i).power for i in range(len(known))])
+    counterparts = build_counterparts(real_root, seed=11)
+    codes = np.stack([make_scan(counterparts, i).power for i in range(len(known))])
     ours, theirs = statistics.scan_statistics(codes), statistics.scan_statistics(real)
     assert ours["forbidden"] == 0 and ours["near_copies"]
     assert statistics.hellinger_distance(ours["histogram"], theirs["histogram"]) < 0.1

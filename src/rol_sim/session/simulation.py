@@ -248,8 +248,8 @@ def _find_route(
     return merge_meshes([*things, parked]), trajectory, traffic
 
 
-def build_twins(real_root: Path | str, seed: int = 1, margin_s: float = 30.0) -> SimulatedSession:
-    """Prepare simulated twins of the real scans whose poses on the real map are known.
+def build_counterparts(real_root: Path | str, seed: int = 1, margin_s: float = 30.0) -> SimulatedSession:
+    """Prepare simulated counterparts of the real scans whose poses on the real map are known.
 
     The world is that of the route; the car drives through the poses of the scans, before and after them it
     goes on as it went.
@@ -276,7 +276,7 @@ def build_twins(real_root: Path | str, seed: int = 1, margin_s: float = 30.0) ->
     known = rall.load_scan_poses(rall.find_scan_poses(real_root))
     stamps, poses = np.array(list(known), dtype=np.int64), np.array(list(known.values()))
     turns = np.full(len(stamps), 250_000, dtype=np.int64)
-    name = "sim-twins"
+    name = "sim-counterparts"
     own = SessionSettings(
         "2019-01-10T14:37:26", len(stamps), seed, parked_share=0.15, vehicles=10, people=6, sweeps="none"
     )
