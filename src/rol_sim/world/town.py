@@ -91,7 +91,7 @@ def add_session_objects(
     leaf_density: float = 1.0,
     changed_share: float = 0.08,
 ) -> Mesh:
-    """Draw what one session finds standing in the town besides what always stands there.
+    """Draw the objects of one session in the town, in addition to the permanent ones.
 
     Parameters
     ----------
