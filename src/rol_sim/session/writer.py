@@ -1,4 +1,4 @@
-"""Write simulated sessions to disk in Oxford's own files.
+"""Write simulated sessions to disk, in the file formats of the data set.
 
 An interrupted session is continued with the same bytes: existing files are whole (they get their
 names last) and are kept. `settings.json` is written first: it shows whether the files belong to the current
