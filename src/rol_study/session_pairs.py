@@ -1,4 +1,4 @@
-"""Make the pairs of a whole session, continuing where a run was stopped."""
+"""Write the pairs of a whole session, continuing where a run was stopped."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The plan of the town: a loop of streets with junctions and side streets, and the lie of the land.
+"""The plan of the town: a loop of streets with junctions and side streets, and the terrain.
 
 All plan coordinates are metres in the town frame: x, y in the plane, z up.
 """

@@ -1,4 +1,4 @@
-"""The town: streets, houses, gardens and the land, drawn once; and what differs from one session to the next.
+"""The town: streets, houses, gardens and terrain, drawn once, and the differences between sessions.
 
 `build_town` draws what stays. `add_session_objects` adds what a session finds: parked vehicles, the leaves of
 its season, cut hedges, changed street furniture. Both are determined by the generator they are given.

@@ -1,4 +1,4 @@
-"""Bodies that come and go: cars, vans, buses, bicycles, people, and the furniture of the street.
+"""Bodies that differ between sessions: cars, vans, buses, bicycles, people, and the furniture of the street.
 
 Frames as in `rol_sim.world.shapes`: origin on the ground in the middle of the body, x forward, y left, z up,
 metres.
