@@ -340,7 +340,7 @@ class PairSettings:
 
     @classmethod
     def from_dict(cls, values: dict[str, Any]) -> PairSettings:
-        """Select the settings among the entries of a dict, such as the header of weights;
+        """Take the settings among the entries of a dict, such as the header of weights;
         defaults for the others."""
         return cls(**{field.name: values[field.name] for field in fields(cls) if field.name in values})
 
@@ -586,7 +586,7 @@ def write_pairs(
     settings: PairSettings | None = None,
     workers: int = 1,
 ) -> Iterator[int]:
-    """Build and save pairs, in several processes if wanted.
+    """Build and save pairs, in several processes if asked for.
 
     Parameters
     ----------

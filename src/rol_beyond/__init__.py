@@ -1,2 +1,2 @@
-"""Methods beyond the paper, for comparison with it: detectors, U-Net, adaptation, motion model,
+"""What goes beyond the paper and is compared with it: detectors, U-Net, adaptation, motion model,
 global search, recovery."""

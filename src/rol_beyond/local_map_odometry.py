@@ -495,7 +495,7 @@ class LocalMapOdometry:
         return log(relative_pose(self.accepted_pose, pose)) / self.blind_s
 
     def _window(self) -> tuple[float, float, float]:
-        """Return the search window, which grows with the time since the last accepted motion."""
+        """Give the search window, which grows with the time since the last accepted motion."""
         if not self.is_twist_known:
             return _FIRST_WINDOW
         x, y, yaw = _WINDOW
@@ -510,7 +510,7 @@ class LocalMapOdometry:
         self._add_keyframe(cloud)
 
     def _map_at(self, twist: np.ndarray) -> LocalMap | None:
-        """Return the local map; while it is one cloud of uncertain velocity,
+        """Give the local map; while it is one cloud of uncertain velocity,
         deskew that cloud with this one."""
         if self.anchor is None:
             return self.local_map

@@ -126,7 +126,7 @@ def count_weights(network: nn.Module) -> int:
 
 
 def _name_layer(module: nn.Module) -> tuple[str, str]:
-    """Name a layer: its kind, and the text above its box."""
+    """Name a layer: its kind, and what stands above its box."""
     if isinstance(module, ResidualBlock):
         return "residual", "residual\nblock"
     is_up = isinstance(module, nn.ConvTranspose2d)

@@ -424,7 +424,7 @@ def run_robust(
     reference_contrast: float,
     report: Report = lambda line: None,
 ) -> Run:
-    """Run the robust filter without resets; without ground truth it begins with global localization.
+    """Run the robust filter without resets; without ground truth it starts anywhere on the map.
 
     Parameters
     ----------
@@ -550,7 +550,7 @@ def fit_official(official: np.ndarray, run: Run, first: int, fraction: float = 0
 
 
 def with_fitted_truth(session: RadarSession, run: Run, first: int) -> RadarSession:
-    """Return a session whose ground truth is its official trajectory, fitted by `fit_official`."""
+    """Give a session whose ground truth is its official trajectory, fitted by `fit_official`."""
     return replace(session, truth=fit_official(session.official, run, first))
 
 

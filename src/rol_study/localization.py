@@ -173,7 +173,7 @@ def run_registration(
     start: np.ndarray,
     monitor: FailureMonitor,
 ) -> FilterRun:
-    """Register each cloud to the map by ICP, without a filter; restart at the ground truth after a failure.
+    """Register each cloud to the map by ICP, without a filter; after a failure from the ground truth.
 
     Parameters
     ----------
