@@ -49,7 +49,7 @@ def draw_streets(rng: np.random.Generator) -> np.ndarray:
 
 
 def open_map(given: str, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, str]:
-    """Give the points of the map, a pose amid them, and what the map is."""
+    """Return the points of the map, a pose among them, and a description of the map."""
     root = rall.find_real_root(given)
     if root is None:
         points = draw_streets(rng)

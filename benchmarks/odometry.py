@@ -212,7 +212,7 @@ def take_turns(ways: dict[str, Steps], n_steps: int) -> tuple[dict[str, np.ndarr
 
 
 def judge(steps: np.ndarray, truth: np.ndarray, longest_m: float) -> dict[str, float]:
-    """Drift over stretches up to a length, and the errors of single steps."""
+    """Drift over segments up to a length, and the errors of single steps."""
     lengths_m = tuple(length for length in KITTI_LENGTHS_M if length <= longest_m)
     report = drift_by_length(accumulate_increments(steps), truth, lengths_m)
     errors = pose_errors(steps, relative_pose(truth[:-1], truth[1:]))
@@ -287,7 +287,7 @@ def judge_published(real_root: str, longest_m: float) -> dict[str, dict[str, flo
 
 
 def describe(sessions: list[str], n_points: float, longest_m: float) -> dict[str, object]:
-    """Say on which machine and clouds, with which versions."""
+    """Describe machine, clouds and versions."""
     version = importlib.metadata.version("small_gicp") if small_gicp else "left out, for it is not installed"
     return {
         **describe_machine(1),

@@ -31,7 +31,7 @@ ROOT = Path(__file__).resolve().parents[1]
 
 
 def build_benchmark_session() -> tuple[SimulatedSession, float]:
-    """Build a session of the route, or of the town without the real data; gives also the seconds it took."""
+    """Build a session of the route, or of the town without the real data; return also the seconds it took."""
     config = "route" if rall.find_real_root() else "demo"
     settings = load_settings(ROOT / "config" / f"{config}.yaml")
     begin = perf_counter()

@@ -65,7 +65,7 @@ def make_plain(network: torch.nn.Module) -> torch.nn.Module:
 
 
 def time_use(name: str, network: torch.nn.Module, image: np.ndarray, rounds: int) -> dict[str, float]:
-    """Time one image through both, and say how far their points are apart."""
+    """Time one image through both, and measure how far their points are apart."""
     plain, ours = make_plain(network.eval()), copy.deepcopy(network).eval()
     if name == "unet":
         ours.fuse()
@@ -117,7 +117,7 @@ def points_with_loops(image: np.ndarray) -> np.ndarray:
 
 
 def time_polar(rounds: int) -> dict[str, float]:
-    """Time polar to Cartesian beside SciPy, and say how far the images are apart."""
+    """Time polar to Cartesian beside SciPy, and measure how far the images are apart."""
     rng = np.random.default_rng(3)
     codes = np.clip(rng.gamma(1.0, 9.0, (400, 3768)), 0, 255).astype(np.uint8)
     azimuths = -2.0 * np.pi * np.arange(400) / 400
@@ -150,7 +150,7 @@ def compare(found: dict[str, float]) -> dict[str, float]:
 
 
 def describe_machine(threads: int) -> dict[str, object]:
-    """Say on which machine, when, and from which commit and versions the figures come."""
+    """Describe machine, date, commit and versions."""
     commit = subprocess.run(
         ["git", "rev-parse", "HEAD"], cwd=ROOT, capture_output=True, text=True, check=False
     ).stdout.strip()

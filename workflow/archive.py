@@ -210,7 +210,7 @@ def times_of(files: Mapping[str, bytes], made: Iterable[str]) -> dict[str, str]:
 
 
 def entity(crate: Any, files: Mapping[str, bytes], path: str) -> Any:
-    """Give the entity of a file; one that stays out of the archive is described without being part of it."""
+    """Describe a file as an entity; one that stays out of the archive is described without being part of it."""
     from rocrate.model.contextentity import ContextEntity
     from rocrate.model.file import File
 
@@ -248,7 +248,7 @@ def collect(root: Path, config: Mapping[str, Any], jobs: list[Job]) -> tuple[dic
 
 
 def make_zip(files: Mapping[str, bytes], executable: set[str], seconds: int) -> bytes:
-    """Make a zip, sorted, with one time [s since 1970, UTC] for all files."""
+    """Write a zip, sorted, with one time [s since 1970, UTC] for all files."""
     content = io.BytesIO()
     with zipfile.ZipFile(content, "w", zipfile.ZIP_DEFLATED) as archive:
         for name in sorted(files):

@@ -68,7 +68,7 @@ class Run:
     method: str = ""
 
     def path(self, out_dir: str | Path) -> Path:
-        """Say where the executed notebook lies."""
+        """Return the path of the executed notebook."""
         parts = [part for part in (self.chapter, self.session, self.method) if part]
         return Path(out_dir, "notebooks", *parts[:-1], f"{parts[-1]}.ipynb")
 
@@ -164,7 +164,7 @@ def literal_assignments(source: str, name: str) -> dict:
 
 
 def notebook_parameters(path: str | Path) -> dict:
-    """Give the parameters of a notebook with their defaults.
+    """Return the parameters of a notebook with their defaults.
 
     Raises
     ------
@@ -181,7 +181,7 @@ def notebook_parameters(path: str | Path) -> dict:
 
 
 def run_parameters(config: dict, run: Run, notebooks: Path = NOTEBOOKS) -> dict:
-    """Give what papermill passes to a run.
+    """Return what papermill passes to a run.
 
     The common settings go to every notebook that asks for them; the parameters of the profile and the session and method
     of the run must be parameters of the notebook (papermill itself would only print a line and go on).
@@ -203,7 +203,7 @@ def run_parameters(config: dict, run: Run, notebooks: Path = NOTEBOOKS) -> dict:
 
 
 def translation(config: dict, notebooks: Path = NOTEBOOKS) -> dict[str, str]:
-    """Give the network that generates the images and the options of `generate_images.py`, as chapter 05 has them.
+    """Return the network that generates the images and the options of `generate_images.py`, as chapter 05 has them.
 
     Returns
     -------

@@ -1,4 +1,4 @@
-"""Put the book together: pages, executed notebooks and generated pages, copied into one folder that Sphinx can build.
+"""Copy pages, executed notebooks and generated pages into one folder that Sphinx can build.
 
 python workflow/stage_book.py config/demo.yaml           stages into the profile's book_dir
 python workflow/stage_book.py --where config/demo.yaml   only says where the built book's first page lies
@@ -39,7 +39,7 @@ RESULT_FIGURES = (
 
 
 def figure_of(cell: nbformat.NotebookNode) -> dict:
-    """Give the figure that the metadata of a cell describe, with its name and its caption; empty where it has none."""
+    """Return the figure that the metadata of a cell describe, with its name and its caption; empty where it has none."""
     return cell.metadata.get("mystnb", {}).get("figure", {})
 
 
@@ -93,7 +93,7 @@ def stage_notebooks(config: dict, book: Path) -> None:
 
 
 def png_of(cell: nbformat.NotebookNode) -> bytes | None:
-    """Take the PNG out of the outputs of a cell; none where the run drew none."""
+    """Return the PNG among the outputs of a cell; none where the run drew none."""
     for output in cell.outputs:
         if "image/png" in output.get("data", {}):
             return base64.b64decode(output.data["image/png"])
@@ -130,7 +130,7 @@ def expand_contents(contents: dict, toolbox: list[dict]) -> dict:
 
 
 def launch_settings(environment: Mapping[str, str]) -> dict:
-    """Give the settings of the button that opens a chapter on Binder; none where no address of the repository is known.
+    """Return the settings of the button that opens a chapter on Binder; none where no address of the repository is known.
 
     Binder builds `environment.yml` with the whole repository around the notebook; what earlier chapters hand on is made
     there by `snakemake -c2 chapters` in a terminal. Colab opens a notebook alone, so no chapter would run there.
@@ -247,7 +247,7 @@ def clear(book: Path) -> None:
 
 
 def stage(config_path: str) -> Path:
-    """Stage the whole book of a profile and give its folder."""
+    """Stage the whole book of a profile; return its folder."""
     config = chapters.load_config(config_path)
     book = Path(config["book_dir"])
     clear(book)

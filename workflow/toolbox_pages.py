@@ -33,7 +33,8 @@ def page_text(title: str, above: str, lines: list[str]) -> str:
 
 def table_of(docstrings: dict[str, str | None]) -> list[str]:
     """Write a table of targets of Sphinx's role `py:obj`, each with the first sentence of its docstring."""
-    lines = [".. list-table::", "   :header-rows: 1", "", "   * - name", "     - description"]
+    options = "   :class: names\n   :header-rows: 1"
+    lines = [".. list-table::", options, "", "   * - name", "     - description"]
     for name, docstring in docstrings.items():
         paragraph = " ".join((docstring or "").split("\n\n")[0].split())
         lines += [f"   * - :py:obj:`{name}`", f"     - {re.split('(?<=[.?!]) (?=[A-Z])', paragraph)[0]}"]

@@ -41,7 +41,7 @@ def read_arguments(words: list[str] | None = None) -> argparse.Namespace:
 
 
 def main(words: list[str] | None = None) -> int:
-    """Train, evaluate and write what is asked for."""
+    """Train, evaluate and write the requested networks."""
     given = read_arguments(words)
     torch.set_num_threads(given.threads)
     recipe = shipped.load_recipe(given.recipe)

@@ -1,4 +1,4 @@
-"""Tables that cells print get captions and numbers, and panels beside one another stack on a narrow screen.
+"""Number the tables that cells print, and stack the panels of figures on a narrow screen.
 
 Sphinx loads this file as an extension, see `local_extensions` in `_config.yml`.
 """
@@ -112,7 +112,7 @@ def add_stacked_pictures(app: Sphinx, exception: Exception | None) -> None:
 
 
 def setup(app: Sphinx) -> dict:
-    """Tell Sphinx when to call what."""
+    """Connect the functions to the events of Sphinx."""
     show = (HTML5Translator.visit_figure, HTML5Translator.depart_figure)
     app.add_enumerable_node(TableFigure, "table", caption_of, html=show)
     app.add_transform(NumberTables)

@@ -1,4 +1,4 @@
-"""Pages that ask nothing of a network and say nothing to the console: what the theme adds and a book on disk cannot use.
+"""Remove from the pages what a book on disk cannot use, and set numbers with their units.
 
 Sphinx loads this file as an extension, see `local_extensions` in `_config.yml`.
 """
@@ -16,12 +16,16 @@ from sphinx.application import Sphinx
 USELESS = re.compile(
     r'\s*<link rel="preload"[^>]*>|\s*<script src="[^"]*/fontawesome/[^"]*\.js[^"]*"></script>', re.IGNORECASE
 )
-# A glued sentence is plain text to Sphinx; the code in it stands in backticks.
-GLUED = re.compile(r'(<span class="pasted-text">)([^<]*`[^<]*)(?=</span>)')
+# A number and its unit stay on one line. The first alternative skips code, scripts and attributes.
+UNIT = re.compile(
+    r"(<(?:pre|script|style)\b.*?</(?:pre|script|style)>|<[^>]+>)|(\d(?:</span>)*)\s(?=(?:%|m/s|[mk]?m|deg|m?s|Hz|MB)(?![\w/]))",
+    re.DOTALL,
+)
+MINUS = re.compile(r'(?<=class="pasted-text">)-(?=\d)')
 
 
 def leave_out_scripts(app: Sphinx, pagename: str, templatename: str, context: dict, doctree: object) -> None:
-    """Take thebe, which runs code on a server of others, from a page, and every script that is there twice (in place)."""
+    """Remove thebe, which runs code on a server, and every script that a page loads twice (in place)."""
     kept = {}
     for script in context.get("script_files", []):
         words = (str(script.filename or ""), str(script.attributes.get("body") or ""))
@@ -33,29 +37,25 @@ def leave_out_scripts(app: Sphinx, pagename: str, templatename: str, context: di
     ]
 
 
-def show_code(match: re.Match) -> str:
-    """Set what stands in backticks in a glued sentence as code."""
-    return match[1] + re.sub(r"`([^`]+)`", r'<code class="docutils literal notranslate">\1</code>', match[2])
-
-
 def clean_pages(app: Sphinx, exception: Exception | None) -> None:
-    """Take what is of no use on disk from the finished pages, set code as code, and let no name stand there twice."""
+    """Remove from the finished pages what is of no use on disk, and set numbers with their signs and units."""
     if exception or app.builder.format != "html":
         return
     for page in Path(app.outdir).rglob("*.html"):
-        before = page.read_text()
-        after = GLUED.sub(show_code, USELESS.sub("", before))
+        before = page.read_text(encoding="utf-8")
+        after = MINUS.sub("−", USELESS.sub("", before))
+        after = UNIT.sub(lambda match: match[1] or f"{match[2]}\N{NO-BREAK SPACE}", after)
         if page.name == "search.html" and page.parent == Path(app.outdir):
             head, mark, rest = after.partition('id="search-input"')
             after = head + mark + rest.replace('id="search-input"', 'id="search-input-of-page"')
         if after != before:
-            page.write_text(after)
+            page.write_text(after, encoding="utf-8")
 
 
 def forget_parts(app: Sphinx, doctree: nodes.document) -> None:
     """Let every node name the page as its document (in place).
 
-    What stands in `eval-rst` was parsed as a document of its own, whose settings hold all that Sphinx knows; it would be
+    The content of `eval-rst` was parsed as a document of its own, whose settings hold all that Sphinx knows. It would be
     written to disk and read again with each of these pages.
     """
     for node in doctree.findall():
@@ -65,12 +65,12 @@ def forget_parts(app: Sphinx, doctree: nodes.document) -> None:
 def readable_defaults(
     app: Sphinx, what: str, name: str, obj: object, options: dict, arguments: str, returns: str
 ) -> tuple:
-    """Give a signature in which a default that is made anew each time is `...`, which Sphinx can parse."""
+    """Replace a default that is created anew for each call by `...`, which Sphinx can parse."""
     return arguments and arguments.replace("<factory>", "..."), returns
 
 
 def setup(app: Sphinx) -> dict:
-    """Tell Sphinx when to call what."""
+    """Connect the functions to the events of Sphinx."""
     app.connect("html-page-context", leave_out_scripts, priority=900)
     app.connect("autodoc-process-signature", readable_defaults)
     app.connect("doctree-read", forget_parts)

@@ -65,7 +65,7 @@ INS_COLUMNS += ["utm_zone", "velocity_north", "velocity_east", "velocity_down", 
 
 
 class OxfordError(ValueError):
-    """A file or a session is not what the data set's description says; the message names file and fault."""
+    """Raised for files and sessions that contradict the description of the data set; names file and fault."""
 
 
 # ---- bytes ----

@@ -42,7 +42,7 @@ class Pix2PixError(ValueError):
 
 @dataclass(frozen=True)
 class TrainConfig:
-    """Settings of a training run; the defaults are the paper's, or the public code's where it gives none."""
+    """Settings of a training run; the defaults are the paper's, or the public code's where it states none."""
 
     ngf: int = 64  # width of the generator's first layer; public default
     n_blocks: int = 9  # residual blocks; Sec. IV-A, "ResNet with 9 blocks"
@@ -114,7 +114,7 @@ REGISTERED_BY = dict.fromkeys(("unet", "folded u-net, running statistics, 1 to 1
 
 
 def register_architecture(network: type[Generator]) -> type[Generator]:
-    """Make an architecture known to `build_generator` and `load_weights`; a decorator of its class."""
+    """Register an architecture for `build_generator` and `load_weights`; a decorator of its class."""
     ARCHITECTURES[network.architecture] = network
     return network
 

@@ -63,7 +63,7 @@ class AdaptationConfig:
 def draw_real_pair(
     generator: Generator, pair: RealPair, turn: float, config: AdaptationConfig, settings: PairSettings
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Make the radar image and the target image of a pair.
+    """Create the radar image and the target image of a pair.
 
     Parameters
     ----------

@@ -90,7 +90,7 @@ class ScanPairs:
         n_ghosts: int = 0,
         rng: np.random.Generator | None = None,
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Make one pair with changes of the surroundings and of the radar.
+        """Create one pair with changes of the surroundings and of the radar.
 
         Parameters
         ----------
@@ -217,7 +217,7 @@ def add_ghosts(power: np.ndarray, n: int, rng: np.random.Generator) -> np.ndarra
 def rotated_radar_image(
     power: np.ndarray, azimuths: np.ndarray, turn: float, twist: Sequence[float], settings: PairSettings
 ) -> np.ndarray:
-    """Make the radar image of `rol.pairs.build_pair` from a scan with rotated surroundings.
+    """Create the radar image of `rol.pairs.build_pair` from a scan with rotated surroundings.
 
     Parameters
     ----------

@@ -360,7 +360,7 @@ class Hypotheses:
 
 
 def no_hypotheses(settings: ConfirmationSettings) -> Hypotheses:
-    """Make an empty set of hypotheses."""
+    """Create an empty set of hypotheses."""
     k, t = settings.n_particles, settings.n_scans
     return Hypotheses(np.zeros((0, k, 3)), np.zeros((0, k)), np.zeros((0, t)))
 
@@ -665,7 +665,7 @@ class RecoveringFilter(ParticleFilter):
         return self.coarse_grid
 
     def _last_clouds(self) -> tuple[list[np.ndarray], list[np.ndarray]]:
-        """Give the scans of the last metres, two seconds at least, and the increments between them."""
+        """Return the scans of the last metres, two seconds at least, and the increments between them."""
         increments = list(self.increments)[-(len(self.clouds) - 1) :]
         driven = np.cumsum([np.hypot(step[0], step[1]) for step in increments[::-1]])
         length_m = self.recovery.relocalization.length_m

@@ -21,7 +21,7 @@ _PARTS = "motion", "measurement", "resampling"
 
 
 def settings_for(method: str, **changes: object) -> MclSettings:
-    """Give the settings of a method by its name.
+    """Return the settings of a method by its name.
 
     Parameters
     ----------

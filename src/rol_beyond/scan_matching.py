@@ -173,7 +173,7 @@ def _crop_target(
     window: tuple[float, float, float],
     cell: float,
 ) -> np.ndarray:
-    """Discard target points out of reach of the source; raise if the rest is too wide for a grid."""
+    """Discard target points too far from the source; raise if the rest is too wide for a grid."""
     longest = np.hypot(*source.T).max() + 1.2 * np.hypot(*window[:2]) + 4.0 * cell
     target = target[np.hypot(*(target - guess[:2]).T) <= longest]
     sides = np.ptp(target, axis=0) if len(target) else np.zeros(2)

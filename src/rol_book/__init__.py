@@ -1,1 +1,1 @@
-"""What the notebooks show: figures, animations, progress bars, checks of their parameters."""
+"""Figures, animations, progress bars and checks of parameters for the notebooks."""

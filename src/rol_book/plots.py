@@ -79,7 +79,7 @@ def style() -> None:
 def subplots(
     n_rows: int = 1, n_columns: int = 1, *, height: float = 4.0, **options: Any
 ) -> tuple[Figure, Any]:
-    """Make a figure of the book's width.
+    """Create a figure of the book's width.
 
     Parameters
     ----------

@@ -18,7 +18,7 @@ PRINTED = {"color": "#444444", "alpha": 0.2, "linewidth": 0}  # range of the pap
 
 
 def split_figure(n: int, height: float) -> tuple[Figure, list[Axes]]:
-    """Make a figure of n panels side by side, each within its own n-th of the width.
+    """Create a figure of n panels side by side, each within its own n-th of the width.
 
     Parameters
     ----------
@@ -213,7 +213,7 @@ def draw_found(trials: Mapping[str, pd.DataFrame], ends_s: Mapping[str, float]) 
 
 
 def recovery_frames(updates: Sequence, clouds: Sequence[np.ndarray], truth: np.ndarray) -> list[Frame]:
-    """Make the frames of an animation of a recovery, for `rol_book.player.play_filter`.
+    """Create the frames of an animation of a recovery, for `rol_book.player.play_filter`.
 
     Parameters
     ----------

@@ -268,7 +268,7 @@ def _draw_curve(ax: Axes, curve: pd.DataFrame, label: str, colour: str) -> None:
 
 
 def network_looks(names: Sequence[str]) -> dict[str, tuple[str, str]]:
-    """Give each network its own name and the book's colour, for `draw_curves`."""
+    """Return each network's name and colour in the book, for `draw_curves`."""
     return {name: (name, FRONT_END_COLOURS.get(name, "#000000")) for name in names}
 
 

@@ -1,1 +1,1 @@
-"""Readers of public data other than Oxford's sessions (RaLL, RADIATE), and their download."""
+"""Readers of public data other than Oxford's sessions (RaLL, MulRan, RADIATE), and their download."""

@@ -63,7 +63,7 @@ def run_git(clone: Path, *arguments: str) -> None:
 
 
 def make_clone(clone: Path, url: str, commit: str) -> None:
-    """Make a clone of one commit, without its files, in an empty folder."""
+    """Clone one commit, without its files, in an empty folder."""
     run_git(clone, "init", "-q")
     run_git(clone, "config", "remote.origin.url", url)
     run_git(clone, "config", "core.sparseCheckout", "true")

@@ -1,5 +1,5 @@
 """Find real pairs: raw Oxford radar scans with lidar sweeps of the same moment,
-wherever they lie below a folder.
+in any layout below a folder.
 
 Public repositories hold pieces of the data set in layouts of their own: scans in one folder, sweeps in
 another, a list of stamps one level higher, one lidar instead of two. Files are recognized by their name

@@ -1,1 +1,1 @@
-"""Simulated sessions: a town, a drive through it, two lidars and a radar, written in Oxford's own files."""
+"""Simulated sessions: a town, a path through it, two lidars and a radar, as files of the data set."""

@@ -10,7 +10,7 @@ from rol_sim.session.writer import write_session
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Write the sessions asked for.
+    """Write the requested sessions.
 
     Parameters
     ----------

@@ -111,7 +111,7 @@ def list_sessions(real_root: Path | str, place: str = "oxford", odometry: str = 
 def select_sessions(
     real_root: Path | str, session: str, place: str = "oxford", odometry: str = "rall"
 ) -> list[str]:
-    """Give the numbers of the sessions that a chapter runs on.
+    """Return the numbers of the sessions that a chapter runs on.
 
     Parameters
     ----------
@@ -146,7 +146,7 @@ def select_sessions(
 
 
 def _has_odometry(real_root: Path | str, place: str, number: str, odometry: str) -> bool:
-    """Check that the odometry of a session is at hand."""
+    """Check that the odometry of a session exists."""
     if odometry not in ODOMETRIES:
         raise RouteError(f"odometry: {odometry!r} is unknown; there are {', '.join(ODOMETRIES)}")
     if odometry == "cfear":
@@ -262,7 +262,7 @@ def match_increments(
 
 
 def published_motion() -> MotionModel:
-    """Give the motion model calibrated on session 01, rounded, for a folder without that session.
+    """Return the motion model calibrated on session 01, rounded, for a folder without that session.
 
     Returns
     -------
@@ -280,7 +280,7 @@ def published_motion() -> MotionModel:
 
 
 def published_reference_contrast(precision_1m: float) -> float:
-    """Give the reference contrast measured on session 01, for a folder without that session.
+    """Return the reference contrast measured on session 01, for a folder without that session.
 
     Parameters
     ----------
@@ -298,7 +298,7 @@ def published_reference_contrast(precision_1m: float) -> float:
 
 
 def exact_motion() -> MotionModel:
-    """Give the motion model of the true increments: no correction,
+    """Return the motion model of the true increments: no correction,
     and the least noise that keeps the particles apart."""
     sigmas = tuple(map(float, MIN_SIGMAS))
     return MotionModel(sigma_stationary=sigmas, sigma_base=sigmas, sigma_per_metre=(0.0, 0.0, 0.0))

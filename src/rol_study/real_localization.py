@@ -61,7 +61,7 @@ class LocalizerSettings:
 
 
 def settings_for_scans() -> LocalizerSettings:
-    """Give the settings chosen by the errors on the eleven scans: many particles at first, fewer later."""
+    """Return the settings chosen by the errors on the eleven scans: many particles at first, fewer later."""
     filter_settings = settings_for(
         "robust",
         n_particles=FIRST_PARTICLES,
@@ -75,7 +75,7 @@ def settings_for_scans() -> LocalizerSettings:
 
 
 def wrong_starts(off_m: float, off_deg: float, n_directions: int) -> np.ndarray:
-    """Give start poses off in all directions, each with both signs of the turn.
+    """Return start poses off in all directions, each with both signs of the turn.
 
     Parameters
     ----------
@@ -95,7 +95,7 @@ def wrong_starts(off_m: float, off_deg: float, n_directions: int) -> np.ndarray:
 
 
 def cache_front_end(make_points: FrontEnd) -> FrontEnd:
-    """Remember the points of a scan and a twist, so that all starts share them."""
+    """Cache the points of a scan and a twist for all starts."""
     known: dict[Any, np.ndarray] = {}
 
     def points_of(scan: Any, twist: tuple[float, float, float] | None) -> np.ndarray:

@@ -142,7 +142,7 @@ class Pair:
 def load_scan_pairs(
     found: RealPairs, scan: PairedScan, min_height: float = -1.5, max_range: float = 64.0
 ) -> dict[tuple[str, str], Pair]:
-    """Load a scan with its sweeps, in every way in which they are compared.
+    """Load a scan with its sweeps, in each form that is compared.
 
     Parameters
     ----------

@@ -229,7 +229,7 @@ def describe_precision(table: pd.DataFrame, network: str) -> dict[str, float]:
 
 
 def lidar_points(pair: RadiatePair) -> np.ndarray:
-    """Give the points of a pair's sweep without the ground, shape (n, 2) [m]."""
+    """Return the points of a pair's sweep without the ground, shape (n, 2) [m]."""
     return crop_range(remove_ground(pair.points), MAX_RANGE_M, MIN_RANGE_M)[:, :2]
 
 

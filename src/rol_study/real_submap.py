@@ -65,7 +65,7 @@ class PlacedSweeps:
     odometry_poses: np.ndarray
 
     def scan_poses(self, stamps_us: Iterable[int]) -> np.ndarray:
-        """Give the poses of radar scans at mid-scan, shape (j, 3);
+        """Return the poses of radar scans at mid-scan, shape (j, 3);
         a SubmapError for a scan without odometry."""
         row = {int(stamp): i for i, stamp in enumerate(self.odometry_stamps_us)}
         missing = [stamp for stamp in stamps_us if int(stamp) not in row]
@@ -352,14 +352,14 @@ def count_sightings(
 
 
 def _to_polar(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Give the bearing in whole degrees, 0..359, and the range of each point [m]."""
+    """Compute the bearing in whole degrees, 0..359, and the range of each point [m]."""
     degrees = np.rad2deg(np.arctan2(points[:, 1], points[:, 0]))
     return np.floor(degrees).astype(int) % 360, np.hypot(points[:, 0], points[:, 1])
 
 
 @dataclass(frozen=True, eq=False)
 class RegisteredSubmap:
-    """A submap on the map, and what its poses say of the poses of radar scans.
+    """A submap registered to the map, and its poses of the radar scans.
 
     Attributes
     ----------

@@ -179,7 +179,7 @@ def _choose(poses: np.ndarray, n: int) -> np.ndarray:
 
 
 def change_front_end(experiment: RouteExperiment, front_end: FrontEnd) -> RouteExperiment:
-    """Give the same experiment with the points of another front end.
+    """Return the same experiment with the points of another front end.
 
     Parameters
     ----------
@@ -207,7 +207,7 @@ def change_front_end(experiment: RouteExperiment, front_end: FrontEnd) -> RouteE
 def _measure_reference(
     map_points: np.ndarray, poses: np.ndarray, front_end: FrontEnd, grid: MapGrid
 ) -> float:
-    """Measure the reference contrast at another session's poses; without them give the published one."""
+    """Measure the reference contrast at another session's poses; without them return the published one."""
     if not len(poses):
         return published_reference_contrast(front_end.fraction_1m)
     visible, rng = find_visible_points(map_points, poses), np.random.default_rng(0)
@@ -483,7 +483,7 @@ def run_displaced(
 def kidnap(
     experiment: RouteExperiment, first: int, seed: int, *, n_scans: int = 60
 ) -> tuple[RecoveryTrial, list, list]:
-    """Start 20 m and 20 deg off, with a filter that takes the start for known (kidnapped robot).
+    """Start 20 m and 20 deg off, with a filter that assumes the start is correct (kidnapped robot).
 
     Parameters
     ----------

@@ -66,7 +66,7 @@ def spread(values: pd.Series, scale: float = 1.0, digits: int = 2) -> str:
 def paper_tables(
     runs: pd.DataFrame, paper2: pd.DataFrame | None, paper3: pd.DataFrame | None
 ) -> tuple[pd.DataFrame, pd.DataFrame]:
-    """Make the paper's Tables II and III from runs of several qualities, with the paper's rows.
+    """Create the paper's Tables II and III from runs of several qualities, with the paper's rows.
 
     Parameters
     ----------

@@ -126,7 +126,7 @@ def experiment_of(
 
 
 def front_end_of(fraction_1m: float, **changes: float) -> FrontEnd:
-    """Give the front end with a fraction of its points within 1 m,
+    """Return the front end with a fraction of its points within 1 m,
     and `fraction_within_2m` of it within 2 m."""
     return FrontEnd(fraction_1m, fraction_within_2m(fraction_1m), **changes)
 
@@ -293,7 +293,7 @@ def measure_rendered(
 
 
 def measure_trial(what: str):
-    """Make the measurement of a wrong start."""
+    """Run the trial of a wrong start."""
 
     def trial(real_root: str, number: str, first: int, seed: int) -> list[dict]:
         found = {"kidnapped": kidnap, "anywhere": localize_globally}[what](

@@ -36,7 +36,7 @@ class SampledPointsError(ValueError):
 
 
 class DenseMapError(SampledPointsError):
-    """The map is so dense that more points lie near it by chance than asked.
+    """The map is so dense that more points lie near it by chance than requested.
 
     Attributes
     ----------
@@ -102,7 +102,7 @@ class FrontEnd:
 
 
 def fraction_within_2m(fraction_1m: float) -> float:
-    """Give the fraction of points within 2 m of the map that real front ends have with a fraction within 1 m.
+    """Return the fraction of points within 2 m of the map of real front ends with a fraction within 1 m.
 
     Parameters
     ----------
@@ -268,7 +268,7 @@ def solve_mixture(fractions: np.ndarray, fraction_1m: float, fraction_2m: float)
 
 
 def _dense_map(fractions: np.ndarray, fraction_1m: float, asked: str) -> DenseMapError:
-    """Make the error for a map with too many points near it by chance; arguments as for `solve_mixture`."""
+    """Create the error for a map with too many points near it by chance; arguments as for `solve_mixture`."""
     near, chance = fractions[:, 0], fractions[:, 2]
     false = (near[0] - fraction_1m) / (near[0] - chance[0])
     least_2m = near[1] + false * (chance[1] - near[1]) if fraction_1m >= chance[0] else float("nan")

@@ -1,4 +1,4 @@
-"""Read what goes into the lidar map of a session, and the simulator's poses of it."""
+"""Read the scans of a session's lidar map, and the simulator's poses of them."""
 
 from __future__ import annotations
 

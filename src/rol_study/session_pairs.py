@@ -1,4 +1,4 @@
-"""Make the pairs of a whole session, continuing where a run was stopped."""
+"""Write the pairs of a whole session, continuing where a run was stopped."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def complete_pairs(
     settings: PairSettings,
     workers: int = 1,
 ) -> Iterator[int]:
-    """Make the pairs of a session that a folder does not have yet, and complete the folder.
+    """Write the pairs of a session that a folder lacks, and complete the folder.
 
     Pairs of other settings, another alignment or another session are made anew.
 

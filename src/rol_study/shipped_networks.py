@@ -156,7 +156,7 @@ def open_set(recipe: dict[str, Any], name: str, places: Places, stride: int = 1)
 
 
 def open_sets(recipe: dict[str, Any], networks: Sequence[dict[str, Any]], places: Places) -> dict[str, Any]:
-    """Make the sessions and open the held-out sets, every second pair for ablations,
+    """Write the sessions and open the held-out sets, every second pair for ablations,
     and the training sets of networks."""
     held_out = {name for name in recipe["sets"] if not name.startswith("learn")}
     wanted = held_out | {network.get("learn", "learn") for network in networks}

@@ -18,7 +18,7 @@ STANDING_M = 0.05  # a step of the ground truth shorter than this is none [m]
 def find_faulty_steps(
     truth: np.ndarray, increments: np.ndarray, *, n_sigmas: float = 10.0, half_window: int = 3
 ) -> np.ndarray:
-    """Mark the steps of a ground truth that odometry which goes on evenly contradicts.
+    """Mark the increments of a ground truth that contradict an even odometry.
 
     A step from one scan to the next is faulty if
 

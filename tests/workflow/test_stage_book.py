@@ -237,17 +237,16 @@ def test_finished_pages_are_cleaned(quiet_pages: ModuleType, tmp_path: Path) -> 
     (tmp_path / "a.html").write_text(
         '<head>\n<link rel="preload" as="font" crossorigin href="f.woff2" />\n<link rel="stylesheet" href="a.css">\n'
         '<script src="_static/vendor/fontawesome/6.5.2/js/all.min.js?digest=1"></script>\n<script src="a.js"></script>'
-        '</head><p><span class="pasted-text">`rol` is better than `paper`</span> `as it stands`</p>',
+        '</head><p><span class="pasted-text">-1.5</span> m or\n60 %, 3 more, 5 m/s</p><pre>2 m</pre><img alt="4 m">',
         encoding="utf-8",
     )
     twice = '<input id="search-input"><input id="search-input">'
     (tmp_path / "search.html").write_text(twice, encoding="utf-8")
     app = SimpleNamespace(outdir=tmp_path, builder=SimpleNamespace(format="html"))
     quiet_pages.clean_pages(app, None)
-    code = '<code class="docutils literal notranslate">{}</code>'
     assert (tmp_path / "a.html").read_text(encoding="utf-8") == (
         '<head>\n<link rel="stylesheet" href="a.css">\n<script src="a.js"></script></head><p><span class="pasted-text">'
-        f"{code.format('rol')} is better than {code.format('paper')}</span> `as it stands`</p>"
+        '−1.5</span>\xa0m or\n60\xa0%, 3 more, 5\xa0m/s</p><pre>2 m</pre><img alt="4 m">'
     )
     assert (tmp_path / "search.html").read_text(encoding="utf-8") == (
         '<input id="search-input"><input id="search-input-of-page">'

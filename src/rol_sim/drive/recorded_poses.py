@@ -30,7 +30,7 @@ CATALOGUE = 24  # so many different vehicles drive about
 
 
 def interpolate_trajectory(stamps_us: np.ndarray, poses: np.ndarray) -> Trajectory:
-    """Drive smoothly through given poses.
+    """Interpolate a smooth trajectory through given poses.
 
     Parameters
     ----------
@@ -105,7 +105,7 @@ def park_vehicles(
     parked_share: float,
     first_object: int,
 ) -> Mesh:
-    """Park vehicles at both kerbs, where the map is free and nobody drives.
+    """Park vehicles at both kerbs, where the map is free and away from the path.
 
     Parameters
     ----------

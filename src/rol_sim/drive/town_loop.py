@@ -260,7 +260,7 @@ def _choose_stops(
 def _time_of_arrival(
     along: np.ndarray, s: np.ndarray, limit: np.ndarray, stops: list[tuple[float, float]], stand_s: float
 ) -> np.ndarray:
-    """Times of arrival and of departure at every point of the line, shape (n, 2), standing at the start."""
+    """Times of arrival and of departure at every point of the line, shape (n, 2), stationary at the start."""
     v = limit.copy()
     v[0] = 0.0
     wait = np.zeros(len(s))

@@ -177,7 +177,7 @@ def _unwrapped(poses: np.ndarray, turn: float) -> np.ndarray:
 def _oncoming(
     route: Route, seconds: np.ndarray, count: int, rng: np.random.Generator
 ) -> list[tuple[Mesh, np.ndarray]]:
-    """Vehicles the other way round the loop: one speed, places at least 15 m apart, so they never meet."""
+    """Oncoming vehicles on the loop: one speed, at least 15 m apart, so they never collide."""
     speed, first = float(rng.uniform(4.5, 7.5)), float(rng.uniform(0.0, route.length))
     room = max(route.length / max(count, 1), 20.0)
     movers = []

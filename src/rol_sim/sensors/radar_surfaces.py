@@ -206,7 +206,7 @@ def scatter(hits, ray_spacing, tail_fraction, tail_m):  # pragma: no cover (comp
 # The three functions below are inlined, since passing tuples of arrays costs a count of references for each.
 @compiled(inline="always")
 def _footprint(hits, i, ray_spacing):  # pragma: no cover (compiled)
-    """Normal in the plane, coordinate along the surface, and half the width [m] that a ray stands for."""
+    """Normal in the plane, coordinate along the surface, and half the width [m] that a ray represents."""
     x, y = hits.points[i, 0], hits.points[i, 1]
     nx, ny = hits.normals[i, 0], hits.normals[i, 1]
     upright = np.hypot(nx, ny)

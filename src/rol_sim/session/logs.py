@@ -52,7 +52,7 @@ def schedule_scans(
 
 
 def draw_row_stamps(stamp_us: int, turn_us: int, rng: np.random.Generator) -> np.ndarray:
-    """Return the times that stand in a scan's rows: they come in bursts of 16, as measured.
+    """Return the times stored in a scan's rows, in bursts of 16, as measured.
 
     Parameters
     ----------

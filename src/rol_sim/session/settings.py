@@ -342,7 +342,7 @@ def _as_mapping(value: Any, where: str) -> Mapping[str, Any]:
 
 
 def _fill(kind: type, values: Mapping[str, Any], where: str, **others: Any) -> Any:
-    """Make settings of values; refuse unknown keys, other types and values out of range."""
+    """Create settings from values; refuse unknown keys, other types and values out of range."""
     values = _check_types(kind, values, where)
     try:
         return kind(**others, **values)

@@ -313,7 +313,7 @@ def _flat(places: np.ndarray) -> np.ndarray:
 
 @lru_cache(maxsize=1)
 def _read_map(path: str, seed: int, unmapped_share: float) -> tuple[Cells, Cells]:
-    """The map, and what stands there without being on it: the same for all sessions of a world."""
+    """Read the map, and the objects missing on it: the same for all sessions of a world."""
     cells = classify_cells(rall.load_map_points(path))
     return cells, draw_unmapped(cells, np.random.default_rng([seed, 0, 98]), fraction=unmapped_share)
 

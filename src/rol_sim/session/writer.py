@@ -1,4 +1,4 @@
-"""Write simulated sessions to disk in Oxford's own files.
+"""Write simulated sessions to disk, in the file formats of the data set.
 
 An interrupted session is continued with the same bytes: existing files are whole (they get their
 names last) and are kept. `settings.json` is written first: it shows whether the files belong to the current
@@ -142,7 +142,7 @@ def _check_disk_space(folder: Path, session: SimulatedSession) -> str:
 def _write_stretches(
     folder: Path, session: SimulatedSession, segments: list[tuple[int, int]], jobs: int
 ) -> Iterator[int]:
-    """Write all scans and sweeps; gives how many scans are there after each segment."""
+    """Write all scans and sweeps; yield the number of scans after each segment."""
     done = 0
     if jobs <= 1:
         for first, end in segments:
@@ -190,7 +190,7 @@ def _write_segment(folder: Path, session: SimulatedSession, first: int, end: int
 
 
 def _prepare_folder(folder: Path, wanted: dict[str, Any], report: Callable[[str], None]) -> bool:
-    """Make the folder fit for these settings; False if the session in it is complete."""
+    """Prepare the folder for these settings; return False if the session in it is complete."""
     path, wanted = folder / "settings.json", json.loads(json.dumps(wanted))
     found = read_marker(path)
     if not {"format", "session"} <= found.keys() and is_used(folder):

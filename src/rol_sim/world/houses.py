@@ -1,4 +1,4 @@
-"""Houses and gardens along the streets: where they stand, without overlap, and their triangles.
+"""Houses and gardens along the streets: their places, without overlap, and their triangles.
 
 A footprint is a row (x, y, yaw, half length, half width) of a rectangle in the plan [m, m, rad, m, m].
 """
@@ -63,7 +63,7 @@ class Builder:
 
 
 def overlaps(footprint: np.ndarray, others: np.ndarray) -> np.ndarray:
-    """Find which rectangles share ground with one rectangle (separating axes).
+    """Find which rectangles overlap one rectangle (separating axes).
 
     Parameters
     ----------

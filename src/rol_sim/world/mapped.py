@@ -183,7 +183,7 @@ def _fit_strips(points, order, cell_of, starts, reach, half, ways):  # pragma: n
 
 
 def _link(points: np.ndarray, headings: np.ndarray, is_straight: np.ndarray) -> np.ndarray:
-    """Number the connected groups: cells of straight rows that go the same way, and the rest."""
+    """Number the connected groups: cells of straight rows in one direction, and the rest."""
     a, b = cKDTree(points).query_pairs(ROW_LINK_M, output_type="ndarray").T
     same_way = np.abs(np.sin(headings[a] - headings[b])) < np.sin(ROW_BEND)
     near = np.hypot(*(points[a] - points[b]).T) < LINK_M

@@ -68,7 +68,7 @@ class Scene:
     Parameters
     ----------
     meshes : Mesh or sequence of Mesh
-        The standing part.
+        The static part.
     threads : int
         Threads for ray casting; 1 leaves the other cores to other sessions.
 
@@ -87,11 +87,11 @@ class Scene:
 
     @property
     def static_mesh(self) -> Mesh:
-        """The standing part."""
+        """The static part."""
         return self._parts[0].mesh
 
     def with_moving(self, meshes: Mesh | Sequence[Mesh]) -> Scene:
-        """Return a scene with the same standing part and these moving bodies.
+        """Return a scene with the same static part and these moving bodies.
 
         Parameters
         ----------
@@ -151,7 +151,7 @@ def _as_rays(rays: np.ndarray) -> tuple[np.ndarray, Tensor]:
 
 
 def _face_origin(normals: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Turn normals against the rays; give also the cosine of incidence."""
+    """Turn normals against the rays; return also the cosine of incidence."""
     along = np.einsum("ij,ij->i", normals, directions)
     length = np.sqrt(np.einsum("ij,ij->i", directions, directions))
     cos_incidence = np.abs(along) / np.maximum(length, 1e-12)

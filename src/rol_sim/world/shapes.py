@@ -13,7 +13,7 @@ from rol_sim.world.mesh import Material, Mesh, make_mesh, merge_meshes
 
 
 def build_quads(corners: np.ndarray, material: np.ndarray | int) -> Mesh:
-    """Make two triangles of every four corners.
+    """Build two triangles from every four corners.
 
     Parameters
     ----------
@@ -35,7 +35,7 @@ def build_quads(corners: np.ndarray, material: np.ndarray | int) -> Mesh:
 
 
 def build_box(x0: float, x1: float, y0: float, y1: float, z0: float, z1: float, material: int) -> Mesh:
-    """Make a closed box between two corners [m]."""
+    """Build a closed box between two corners [m]."""
     x, y, z = np.meshgrid([x0, x1], [y0, y1], [z0, z1], indexing="ij")
     corners = np.stack([x, y, z], axis=-1).reshape(8, 3)  # corner number = 4 ix + 2 iy + iz
     faces = [[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]]
@@ -45,7 +45,7 @@ def build_box(x0: float, x1: float, y0: float, y1: float, z0: float, z1: float, 
 def build_cylinder(
     radius: float, z0: float, z1: float, material: int, sides: int = 8, lean: float = 0.0
 ) -> Mesh:
-    """Make an upright pole with a lid; `lean` moves its top forward [m]."""
+    """Build an upright pole with a lid; `lean` moves its top forward [m]."""
     angle = 2.0 * np.pi * np.arange(sides + 1) / sides
     foot = np.stack([radius * np.cos(angle), radius * np.sin(angle), np.full(sides + 1, z0)], axis=1)
     top = foot + (lean, 0.0, z1 - z0)
@@ -58,7 +58,7 @@ def build_cylinder(
 def lay_facade(
     start: np.ndarray, end: np.ndarray, z0: float, z1: float, *, windows: int, recess: float = 0.12
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Lay out an outer wall with rows of windows; the outside lies to the right of the way from start to end.
+    """Lay out an outer wall with rows of windows; the outside lies to the right, seen from start to end.
 
     Parameters
     ----------
@@ -116,7 +116,7 @@ def _window_grid(length: float, z0: float, z1: float, windows: int) -> tuple[np.
 def build_block(
     x0: float, x1: float, y0: float, y1: float, height: float, rise: float, *, windows: float = 2.4
 ) -> Mesh:
-    """Make a house body: four outer walls and a gable roof with its ridge along x.
+    """Build a house body: four outer walls and a gable roof with its ridge along x.
 
     Parameters
     ----------
@@ -149,7 +149,7 @@ def build_block(
 
 
 def build_house(width: float, depth: float, height: float, rng: np.random.Generator) -> Mesh:
-    """Make a house whose front centre is the origin, with a bay, porch, recess or wing as it comes.
+    """Build a house whose front centre is the origin, with a bay, porch, recess or wing at random.
 
     Parameters
     ----------
@@ -195,12 +195,12 @@ def build_house(width: float, depth: float, height: float, rng: np.random.Genera
 
 
 def build_wall(length: float, height: float, thickness: float, material: int) -> Mesh:
-    """Make a straight wall from the origin along x, standing half a metre deep in the ground [m]."""
+    """Build a straight wall from the origin along x, half a metre deep in the ground [m]."""
     return build_box(0.0, length, -0.5 * thickness, 0.5 * thickness, -0.5, height, material)
 
 
 def build_railing(length: float, height: float) -> Mesh:
-    """Make an iron railing from the origin along x: bars every 0.25 m and two rails [m]."""
+    """Build an iron railing from the origin along x: bars every 0.25 m and two rails [m]."""
     x = np.arange(0.0, length, 0.25)
     turn = np.deg2rad(45.0)  # bars are crossed strips, so they show from every side
     parts = []
@@ -224,7 +224,7 @@ def build_railing(length: float, height: float) -> Mesh:
 
 
 def build_hedge(length: float, width: float, height: float, rng: np.random.Generator) -> Mesh:
-    """Make a hedge from the origin along x: a closed body whose skin is bumpy by about 0.1 m [m]."""
+    """Build a hedge from the origin along x: a closed body whose skin is bumpy by about 0.1 m [m]."""
     n = max(2, round(length / 0.6) + 1)
     x = np.linspace(0.0, length, n)
     profile = np.array([[-0.5, -0.3], [-0.55, 0.5], [-0.35, 1.0], [0.35, 1.0], [0.55, 0.5], [0.5, -0.3]])
@@ -246,7 +246,7 @@ def build_tree(
     density: float,
     rng: np.random.Generator,
 ) -> Mesh:
-    """Make a tree: a leaning trunk, and a crown of loose flakes through which part of the rays pass.
+    """Build a tree: a leaning trunk, and a crown of loose flakes through which part of the rays pass.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""The plan of the town: a loop of streets with junctions and side streets, and the lie of the land.
+"""The plan of the town: a loop of streets with junctions and side streets, and the terrain.
 
 All plan coordinates are metres in the town frame: x, y in the plane, z up.
 """
@@ -249,6 +249,6 @@ def _bend(start: np.ndarray, end: np.ndarray, bow: float, spacing: float = 0.5) 
 
 
 def _on_loop(edges: list[np.ndarray], place: float) -> np.ndarray:
-    """Corner number plus the fraction of the way to the next corner -> point."""
+    """Corner number plus the fraction of the distance to the next corner -> point."""
     edge = edges[int(place) % len(edges)]
     return edge[round((place % 1.0) * (len(edge) - 1))]

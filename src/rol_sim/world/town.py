@@ -1,4 +1,4 @@
-"""The town: streets, houses, gardens and the land, drawn once; and what differs from one session to the next.
+"""The town: streets, houses, gardens and terrain, drawn once, and the differences between sessions.
 
 `build_town` draws what stays. `add_session_objects` adds what a session finds: parked vehicles, the leaves of
 its season, cut hedges, changed street furniture. Both are determined by the generator they are given.
@@ -91,7 +91,7 @@ def add_session_objects(
     leaf_density: float = 1.0,
     changed_share: float = 0.08,
 ) -> Mesh:
-    """Draw what one session finds standing in the town besides what always stands there.
+    """Draw the objects of one session in the town, in addition to the permanent ones.
 
     Parameters
     ----------

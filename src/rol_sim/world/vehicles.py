@@ -1,4 +1,4 @@
-"""Bodies that come and go: cars, vans, buses, bicycles, people, and the furniture of the street.
+"""Bodies that differ between sessions: cars, vans, buses, bicycles, people, and the furniture of the street.
 
 Frames as in `rol_sim.world.shapes`: origin on the ground in the middle of the body, x forward, y left, z up,
 metres.
@@ -102,7 +102,7 @@ MOVING_KINDS = (("car", 0.5), ("estate", 0.2), ("van", 0.14), ("lorry", 0.06), (
 
 
 def build_vehicle(kind: str, rng: np.random.Generator) -> Mesh:
-    """Make a motor vehicle of a kind, its size drawn about the kind's mean.
+    """Build a motor vehicle of a kind, its size drawn about the kind's mean.
 
     Parameters
     ----------
@@ -143,13 +143,13 @@ def build_vehicle(kind: str, rng: np.random.Generator) -> Mesh:
 
 
 def draw_kind(kinds: tuple[tuple[str, float], ...], rng: np.random.Generator) -> str:
-    """Draw a kind of vehicle from a table of kinds and shares."""
+    """Draw a kind of vehicle from a table of kinds and fractions."""
     names, shares = zip(*kinds, strict=True)
     return str(rng.choice(names, p=np.array(shares) / np.sum(shares)))
 
 
 def build_cyclist(rng: np.random.Generator) -> Mesh:
-    """Make a person on a bicycle."""
+    """Build a person on a bicycle."""
     lean = float(rng.uniform(0.1, 0.3))
     rider = build_cylinder(0.2, 0.8, float(rng.uniform(1.6, 1.8)), Material.PERSON, lean=lean)
     frame = build_box(-0.8, 0.8, -0.02, 0.02, 0.35, 0.75, Material.METAL)
@@ -158,14 +158,14 @@ def build_cyclist(rng: np.random.Generator) -> Mesh:
 
 
 def build_pedestrian(rng: np.random.Generator) -> Mesh:
-    """Make a person on foot."""
+    """Build a person on foot."""
     return build_cylinder(
         float(rng.uniform(0.18, 0.26)), 0.0, float(rng.uniform(1.5, 1.9)), Material.PERSON, sides=6
     )
 
 
 def build_furniture(kind: str, rng: np.random.Generator) -> Mesh:
-    """Make a piece of street furniture.
+    """Build a piece of street furniture.
 
     Parameters
     ----------
