@@ -1,36 +1,13 @@
-"""Metrics beyond those of the paper: median, longitudinal and lateral errors,
-and consistency of covariances (NEES)."""
+"""Consistency of covariances with the errors (NEES)."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from rol.evaluation import EvaluationError, PoseErrors, check_pair, rmse
+from rol.evaluation import EvaluationError, check_pair
 from rol.geometry import wrap_angle
 
 NEES_95 = 7.814727903251179  # 95 % quantile of the chi-square distribution with three degrees of freedom
-
-
-def error_figures(errors: PoseErrors) -> dict[str, float]:
-    """Compute metrics beyond those of the paper: medians, longitudinal and lateral errors.
-
-    Parameters
-    ----------
-    errors : PoseErrors
-        From `rol.evaluation.pose_errors`.
-
-    Returns
-    -------
-    figures : dict
-        ``median_m`` and ``median_yaw_deg`` of the absolute errors, ``rmse_longitudinal_m`` and
-        ``rmse_lateral_m`` in the true radar frame. Not part of ``metrics.json``.
-    """
-    return {
-        "median_m": float(np.median(errors.position_m)),
-        "median_yaw_deg": float(np.median(np.abs(np.rad2deg(errors.yaw_rad)))),
-        "rmse_longitudinal_m": rmse(errors.longitudinal_m),
-        "rmse_lateral_m": rmse(errors.lateral_m),
-    }
 
 
 def pose_nees(estimate: np.ndarray, truth: np.ndarray, covariances: np.ndarray) -> np.ndarray:

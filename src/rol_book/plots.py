@@ -573,35 +573,6 @@ def draw_distances(ax: Axes, counts: np.ndarray, edges: np.ndarray, *, text: str
     return ax
 
 
-def draw_dots(ax: Axes, values: Sequence[np.ndarray], names: Sequence[str], *, colour: str) -> Axes:
-    """Draw one column of dots per name, with a bar at the mean.
-
-    Parameters
-    ----------
-    ax : Axes
-        Where to draw.
-    values : sequence of arrays, shape (n,)
-        Values of each column; nan is left out.
-    names : sequence of str
-        Names under the columns.
-    colour : str
-        Colour of the dots.
-
-    Returns
-    -------
-    ax : Axes
-        The axes.
-    """
-    for place, column in enumerate(values):
-        aside = 0.6 * ((np.arange(len(column)) * 0.618) % 1.0 - 0.5)  # spread sideways, always the same
-        ax.scatter(place + aside, column, s=7, color=colour, alpha=0.4, linewidths=0)
-        if np.isfinite(column).any():
-            ax.hlines(np.nanmean(column), place - 0.35, place + 0.35, color="black", linewidth=2.0)
-    ax.set_xticks(range(len(names)), names)
-    ax.grid(False, axis="x")
-    return ax
-
-
 # ---- sessions ----
 
 

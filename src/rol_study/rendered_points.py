@@ -16,9 +16,8 @@ import numpy as np
 
 from rol.geometry import relative_pose
 from rol.oxford import RadarOdometry
-from rol.pairs import estimate_twists, save_image
+from rol.pairs import estimate_twists
 from rol.pix2pix import TrainedNetwork
-from rol.radar import SDK, polar_to_cartesian
 from rol_beyond.front_ends import generate_points
 from rol_data import rall
 from rol_sim.session.settings import parse_settings
@@ -140,22 +139,3 @@ def true_twists(session: SimulatedSession) -> np.ndarray:
     steps = np.zeros((len(poses) - 1, 6))
     steps[:, [0, 1, 5]] = relative_pose(poses[:-1], poses[1:])
     return estimate_twists(RadarOdometry(middles[1:], middles[:-1], first[1:], first[:-1], steps))
-
-
-def write_radar_images(session: SimulatedSession, folder: Path | str) -> None:
-    """Write the radar scans of a simulated session as `rol_data.rall.load_radar_images` reads real ones.
-
-    Parameters
-    ----------
-    session : SimulatedSession
-        From `build_segment`.
-    folder : path
-        Where ``1.png``, ``2.png`` and so on are written: 512 x 512, 0.25 m per pixel, in the convention of
-        the data set's SDK. Images that are there already are kept.
-    """
-    for index in range(len(session.scans_us)):
-        path = Path(folder, f"{index + 1}.png")
-        if not path.is_file():
-            scan = make_scan(session, index)
-            image = polar_to_cartesian(scan.power, scan.azimuths, calibration=SDK)
-            save_image(path, np.rint(255.0 * image).astype(np.uint8))

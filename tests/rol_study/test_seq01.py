@@ -15,14 +15,16 @@ import torch
 from rol.evaluation import read_metrics, read_tum
 from rol.geometry import accumulate_increments, compose, invert, relative_pose, transform_points
 from rol.oxford import OxfordError, RadarOdometry
+from rol.pairs import save_image
 from rol.pix2pix import TrainedNetwork
+from rol.radar import SDK, polar_to_cartesian
 from rol_beyond.front_ends import detect_points
 from rol_data import rall
 from rol_sim.session import oxford_files
 from rol_sim.session.simulation import make_scan
 from rol_study import end_to_end, seq01
 from rol_study.end_to_end import EndToEndError, RadarSession, Run, keep_points, open_oxford
-from rol_study.rendered_points import build_segment, write_radar_images
+from rol_study.rendered_points import build_segment
 
 QUIET = {"vehicles": 0, "people": 0, "parked_share": 0.0}
 NOBODY = TrainedNetwork(torch.nn.Linear(1, 1), {}, {}, {})  # type: ignore[arg-type]  # asked for nothing below
@@ -315,7 +317,11 @@ def test_twenty_images_of_seq01_go_through_network_and_filters(
     (tmp_path / rall.POSES_PATH).mkdir(parents=True)
     np.savetxt(tmp_path / rall.POSES_PATH / number, poses)
     folder = tmp_path / rall.IMAGES_PATH / "seq02"
-    write_radar_images(build_segment(real_root, "02", first, n, 5), folder)
+    made = build_segment(real_root, "02", first, n, 5)
+    for k in range(n):
+        scan = make_scan(made, k)
+        image = polar_to_cartesian(scan.power, scan.azimuths, calibration=SDK)
+        save_image(folder / f"{k + 1}.png", np.rint(255.0 * image).astype(np.uint8))
     assert seq01.main(["--real-root", str(tmp_path), "--out", str(tmp_path / "out")]) == 0
     assert "published" in capsys.readouterr().out
     table = pd.read_csv(tmp_path / "out" / "seq02" / "results.csv").set_index("method")
