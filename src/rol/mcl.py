@@ -557,7 +557,7 @@ class MclUpdate:
 
     @property
     def covariance(self) -> np.ndarray:
-        """Covariance of the particles (x, y, yaw), shape (3, 3) [m, m, rad], plus (1 cm)^2 and (0.05 deg)^2."""
+        """Covariance of (x, y, yaw), shape (3, 3) [m, m, rad], enlarged by 1 cm and 0.05 deg (squared)."""
         away = self.particles - self.pose
         away[:, 2] = wrap_angle(away[:, 2])
         return (away * self.weights[:, None]).T @ away + np.diag([1e-4, 1e-4, np.deg2rad(0.05) ** 2])

@@ -314,8 +314,8 @@ def _count_around(target, enough):
 def _find_nearest(x, y, target, limit):
     """Find the nearest point to (x, y) below a squared distance; return its index and squared distance.
 
-    Without such a point these are -1 and the limit. Cells of the `SortedCloud` are searched in square rings, until the next ring is too far away or the torus
-    is closed.
+    Without such a point these are -1 and the limit. Cells of the `SortedCloud` are searched in square rings,
+    until the next ring is too far away or the torus is closed.
     """
     points, starts, around = target
     width = np.int64(np.sqrt(len(starts) - 1))

@@ -18,15 +18,7 @@ import numpy as np
 from scipy import fft
 from scipy.spatial import cKDTree
 
-from rol.geometry import (
-    check_fields,
-    check_grid,
-    check_pose,
-    compose,
-    invert,
-    transform_points,
-    wrap_angle,
-)
+from rol.geometry import check_fields, check_grid, check_pose, compose, invert, transform_points, wrap_angle
 from rol.mcl import MapGrid, count_matches
 
 OTHER_HEADINGS = np.deg2rad(np.arange(20.0, 341.0, 20.0))  # relative to a pose; points match there by chance

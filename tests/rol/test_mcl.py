@@ -10,14 +10,7 @@ from rol.geometry import transform_points
 
 # 5 x 5 cells of 1 m: a wall along x = 2.5 (row 2) and a post at (4.5, 0.5); first axis x, second axis y
 MATCHED = np.array(
-    [
-        [0, 0, 0, 0, 0],
-        [0, 0, 0, 0, 0],
-        [1, 1, 1, 1, 1],
-        [0, 0, 0, 0, 0],
-        [1, 0, 0, 0, 0],
-    ],
-    dtype=np.uint8,
+    [[0, 0, 0, 0, 0], [0, 0, 0, 0, 0], [1, 1, 1, 1, 1], [0, 0, 0, 0, 0], [1, 0, 0, 0, 0]], dtype=np.uint8
 )
 CLOUD = np.array([[2.0, 0.0], [2.0, 1.0], [4.0, -2.0]])  # two wall points ahead, the post ahead to the right
 ORIGIN = np.zeros(2)

@@ -229,11 +229,7 @@ def test_the_published_contrast_is_that_of_session_01(real_root: Path) -> None:
 
 
 def test_a_session_alone_is_not_calibrated_on_itself(real_root: Path, tmp_path: Path) -> None:
-    for name in (
-        rall.MAP_PATH,
-        f"{rall.POSES_PATH}/pose_xy_02.txt",
-        f"{rall.ODOMETRY_PATH}/seq02_odom.txt",
-    ):
+    for name in (rall.MAP_PATH, f"{rall.POSES_PATH}/pose_xy_02.txt", f"{rall.ODOMETRY_PATH}/seq02_odom.txt"):
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).symlink_to(real_root / name)
     experiment = prepare_experiment(tmp_path, "02", FrontEnd(), max_scans=3)

@@ -152,6 +152,8 @@ def test_metadata_files_of_macos_are_passed_over(tmp_path: Path, monkeypatch: py
     staged = stage_book.stage(str(ROOT / "config/smoke.yaml"))
     assert (staged / "toolbox/rol/mcl.md").is_file() and (staged / "intro.md").is_file()
     assert not list(staged.rglob("._*"))
+    for other in set(package.parent.glob("rol*")) - {package}:  # one package is enough for the digest
+        shutil.rmtree(other)
     assert chapters.stored_digest(new_notebook(), chapters.load_config(ROOT / "config/smoke.yaml"))
 
 
