@@ -24,8 +24,7 @@ MIN_SIGMAS = (0.02, 0.01, np.deg2rad(0.1))  # of a stationary vehicle, which may
 
 @dataclass(frozen=True)
 class MotionModel:
-    """Distribution of the true increment given a measured one; the defaults take the odometry as it is,
-    with wide noise.
+    """Distribution of the true increment given a measured one; by default the odometry with wide noise.
 
     A `rol.mcl.MclSettings.motion`. Yin et al. 2020, Sec. III-B, Eq. 7, with calibrated noise.
 
@@ -167,8 +166,7 @@ def calibrate_motion(
 
 
 def _fit_stationary(increments: np.ndarray, truth: np.ndarray) -> np.ndarray:
-    """Fit a diagonal matrix to increments of a stationary vehicle;
-    the identity where there are fewer than 20."""
+    """Fit a diagonal matrix to increments of a stationary vehicle; the identity for fewer than 20."""
     if len(increments) < 20:
         return np.eye(3)
     return np.diag(np.sum(increments * truth, axis=0) / np.maximum(np.sum(increments**2, axis=0), 1e-12))
@@ -181,8 +179,7 @@ def _find_outliers(increments: np.ndarray, truth: np.ndarray) -> np.ndarray:
 
 
 def _fit_noise(errors: np.ndarray, length: np.ndarray, stationary: np.ndarray) -> list[tuple[float, ...]]:
-    """Fit the three standard deviations of the model;
-    `stationary` is the stationary fraction of each window."""
+    """Fit the standard deviations of the model; `stationary` is a fraction of each window."""
 
     def spread(chosen: np.ndarray, otherwise: np.ndarray) -> np.ndarray:
         return np.sqrt(np.mean(errors[chosen] ** 2, axis=0)) if chosen.sum() > 4 else otherwise

@@ -16,8 +16,9 @@ FrontEnd = Callable[[Any, tuple[float, float, float] | None], np.ndarray]
 
 
 class RobustLocalizer:
-    """Localize radar scans on a lidar map, one at a time, with recovery;
-    has the ``step`` of `rol.pipeline.RadarLocalizer`.
+    """Localize radar scans on a lidar map, one at a time, with recovery.
+
+    It has the ``step`` of `rol.pipeline.RadarLocalizer`.
 
     Parameters
     ----------

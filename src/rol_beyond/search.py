@@ -296,8 +296,7 @@ def _refine(
 def suppress_neighbours(
     poses: np.ndarray, order: np.ndarray, n: int, separation: tuple[float, float]
 ) -> list[int]:
-    """Go through poses in an order and keep those that are not close to one kept before
-    (non-maximum suppression).
+    """Keep the poses, in an order, that are not close to one kept before (non-maximum suppression).
 
     Parameters
     ----------

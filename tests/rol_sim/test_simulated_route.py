@@ -246,7 +246,7 @@ def test_two_writers_killed_and_one_that_goes_on_give_the_same_bytes(
     (killed / NAME / "radar" / ".1.png.99.tmp").write_bytes(b"half")  # what a write in progress leaves
     lines: list[str] = []
     whole = writer.write_session(settings, NAME, tmp_path / "whole", lines.append)
-    assert "8 scans and 0 sweeps, about 0.01 GB in all" in lines[0] and lines[-1] == f"{NAME}: complete"
+    assert "8 scans and 0 sweeps, about 0.00 GB in all" in lines[0] and lines[-1] == f"{NAME}: complete"
     assert digests(writer.write_session(settings, NAME, killed)) == digests(whole)
     assert not (whole / "velodyne_left").exists()
 
