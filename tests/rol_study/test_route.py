@@ -217,8 +217,9 @@ def test_the_published_motion_is_that_of_session_01(real_root: Path) -> None:
 
 
 def test_the_published_contrast_is_that_of_session_01(real_root: Path) -> None:
+    experiment = prepare_experiment(real_root, "02", FrontEnd(), max_scans=3)
     for front_end in (FrontEnd(), FrontEnd(0.50, 0.70), FrontEnd(0.65, 0.80), FrontEnd(0.80, 0.90)):
-        taught = prepare_experiment(real_root, "02", front_end, max_scans=3)
+        taught = change_front_end(experiment, front_end)
         assert taught.calibration_session == "01"
         assert published_reference_contrast(front_end.fraction_1m) == pytest.approx(
             taught.reference_contrast, abs=0.003
