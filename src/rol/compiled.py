@@ -38,8 +38,7 @@ def compiled(function: Callable | None = None, **options: Any) -> Callable:
 
 
 class _TolerantCache(FunctionCache):
-    """numba's cache, except that unreadable files are replaced and files that cannot be written are
-    skipped."""
+    """numba's cache; it replaces files that cannot be read and skips those that cannot be written."""
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         with contextlib.suppress(Exception):  # damaged pickles raise almost any exception

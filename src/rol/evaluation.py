@@ -25,7 +25,7 @@ KITTI_LENGTHS_M = tuple(100.0 * k for k in range(1, 9))  # segments of the KITTI
 
 
 class EvaluationError(ValueError):
-    """Raised for trajectories and files that cannot be evaluated; names the file and the fault."""
+    """A trajectory or file that cannot be evaluated; the message names the file and the fault."""
 
 
 @dataclass(frozen=True)
@@ -99,7 +99,11 @@ def fraction_within(errors: PoseErrors, max_position_m: float, max_yaw_deg: floa
     Returns
     -------
     fraction : float
-        Between 0 and 1. Yin et al. 2020, Table III.
+        Between 0 and 1.
+
+    Notes
+    -----
+    Yin et al. 2020, Table III.
     """
     inside = (errors.position_m < max_position_m) & (np.abs(np.rad2deg(errors.yaw_rad)) < max_yaw_deg)
     return float(np.mean(inside))
@@ -205,7 +209,11 @@ def summarize(
     Returns
     -------
     metrics : dict
-        The keys of ``METRICS``; fractions between 0 and 1. Yin et al. 2020, Tables II and III.
+        The keys of ``METRICS``; fractions between 0 and 1.
+
+    Notes
+    -----
+    Yin et al. 2020, Tables II and III.
     """
     errors = pose_errors(estimate, truth)
     fractions = {f"within_{m:.0f}m_{deg:.0f}deg": fraction_within(errors, m, deg) for m, deg in CLASSES}
@@ -420,8 +428,7 @@ def check_pair(estimate: np.ndarray, truth: np.ndarray) -> tuple[np.ndarray, np.
 
 
 def _segment_errors(estimate: np.ndarray, truth: np.ndarray, length_m: float) -> np.ndarray:
-    """Compute the errors at the end of segments of one length, shape (n, 2): position [%],
-    heading [deg per 100 m]."""
+    """Compute errors at the ends of segments of one length, shape (n, 2) [%, deg per 100 m]."""
     path_m = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(truth[:, :2], axis=0).T))])
     first = np.arange(0, len(path_m), 10)
     last = np.searchsorted(path_m, path_m[first] + length_m)

@@ -31,7 +31,7 @@ _WAITING_POINTS = 50_000  # number of points that are added to a map at once
 
 
 class MapError(ValueError):
-    """Raised for maps without points and for clouds that do not match their poses."""
+    """A map without points, a damaged file, or clouds that do not match their poses."""
 
 
 def thin_points(points: np.ndarray, cell: float) -> tuple[np.ndarray, np.ndarray]:
@@ -80,8 +80,11 @@ def accumulate_map(
     Raises
     ------
     MapError
-        If the numbers of clouds and poses differ, a point is not finite, or no cell is kept. Yin et al. 2020,
-        Sec. IV-A.
+        If the numbers of clouds and poses differ, a point is not finite, or no cell is kept.
+
+    Notes
+    -----
+    Yin et al. 2020, Sec. IV-A.
     """
     poses, n_clouds, waiting, n_waiting = check_poses(poses), 0, [], 0
     end_mark = np.iinfo(np.int64).max
@@ -181,12 +184,15 @@ def register_maps(
     Returns
     -------
     registration : Registration
-        Yin et al. 2020, Sec. IV-A, "a precise ICP method".
 
     Raises
     ------
     MapError
         If a map is empty.
+
+    Notes
+    -----
+    Yin et al. 2020, Sec. IV-A, "a precise ICP method".
     """
     for points, name in ((source, "source"), (target, "target")):
         if len(points) == 0:
@@ -216,7 +222,11 @@ def to_first_map(T_map_session: np.ndarray, poses: np.ndarray) -> np.ndarray:
     Returns
     -------
     poses : array, shape (n, 3)
-        Poses T_map_radar. Yin et al. 2020, Sec. IV-A.
+        Poses T_map_radar.
+
+    Notes
+    -----
+    Yin et al. 2020, Sec. IV-A.
     """
     return compose(check_pose(T_map_session, "T_map_session"), check_poses(poses))
 

@@ -23,7 +23,7 @@ else:  # this file was copied and is imported by its own name
 
 
 class MclError(ValueError):
-    """Raised for input with which no filter update is possible."""
+    """A value with which no filter update is possible; the message names it."""
 
 
 @dataclass(frozen=True)
@@ -172,7 +172,7 @@ class MapGrid:
     cell : float
         Side of a cell [m].
     best : int
-        Score on the map.
+        Largest score, that of a point on the map.
     """
 
     values: np.ndarray
@@ -249,7 +249,11 @@ def build_matched_grid(map_points: np.ndarray, d_th: float = 0.5, cell: float = 
     Returns
     -------
     grid : MapGrid
-        1 where matched, else 0. Yin et al. 2020, Sec. III-B, Eq. 9.
+        1 where matched, else 0.
+
+    Notes
+    -----
+    Yin et al. 2020, Sec. III-B, Eq. 9.
     """
     return MapGrid(*tabulate_distances(map_points, cell, d_th, np.ones(1, dtype=np.uint8)), cell)
 
@@ -300,12 +304,16 @@ def count_matches(particles: np.ndarray, points: np.ndarray, grid: MapGrid) -> n
     Returns
     -------
     counts : array of int, shape (n,)
-        N of Eq. 8; zeros for a scan without points. Yin et al. 2020, Sec. III-B, Eq. 9.
+        N of Eq. 8; zeros for a scan without points.
 
     Raises
     ------
     MclError
         If the points or the grid have another shape or type, or a point is not finite.
+
+    Notes
+    -----
+    Yin et al. 2020, Sec. III-B, Eq. 9.
     """
     particles, points = check_poses(particles, "particles"), check_points(points, "cloud", error=MclError)
     matched = grid.values
@@ -370,7 +378,11 @@ def predict(
     Returns
     -------
     particles : array, shape (n, 3)
-        Poses at this scan. Yin et al. 2020, Sec. III-B, Eq. 7.
+        Poses at this scan.
+
+    Notes
+    -----
+    Yin et al. 2020, Sec. III-B, Eq. 7.
     """
     increment = check_pose(increment, "odometry increment")
     return compose(particles, motion.sample(increment, len(particles), rng))
@@ -389,13 +401,16 @@ def log_weights(counts: np.ndarray, exponent: float) -> np.ndarray:
     Returns
     -------
     log_weights : array, shape (n,)
-        lambda log N; minus infinity where nothing matched. Logarithms, as 1000^200 overflows. Yin et al.
-        2020, Sec. III-B, Eq. 8.
+        lambda log N; minus infinity where nothing matched. Logarithms, as 1000^200 overflows.
 
     Raises
     ------
     MclError
         If a count is negative or not finite, or the exponent is not above zero.
+
+    Notes
+    -----
+    Yin et al. 2020, Sec. III-B, Eq. 8.
     """
     counts = np.asarray(counts, dtype=np.float64)
     if not np.isfinite(counts).all() or (counts < 0).any():
@@ -542,8 +557,7 @@ class MclUpdate:
 
     @property
     def covariance(self) -> np.ndarray:
-        """Covariance of (x, y, yaw), shape (3, 3) [m, m, rad]: that of the particles,
-        plus 1 cm and 0.05 deg."""
+        """Covariance of (x, y, yaw), shape (3, 3) [m, m, rad], enlarged by 1 cm and 0.05 deg (squared)."""
         away = self.particles - self.pose
         away[:, 2] = wrap_angle(away[:, 2])
         return (away * self.weights[:, None]).T @ away + np.diag([1e-4, 1e-4, np.deg2rad(0.05) ** 2])
@@ -575,7 +589,10 @@ def update(
     Returns
     -------
     result : MclUpdate
-        Yin et al. 2020, Sec. III-B, Eq. 6-9.
+
+    Notes
+    -----
+    Yin et al. 2020, Sec. III-B, Eq. 6-9.
     """
     is_used, inlier_ratio = len(points) > 0, 0.0
     if is_used:
@@ -632,7 +649,10 @@ class ParticleFilter:
         Returns
         -------
         result : MclUpdate
-            Yin et al. 2020, Sec. III-B, Eq. 6-9.
+
+        Notes
+        -----
+        Yin et al. 2020, Sec. III-B, Eq. 6-9.
         """
         if increment is not None:
             self.particles = predict(self.particles, increment, self.settings.motion, self.rng)
@@ -664,12 +684,16 @@ def localize(
     Yields
     ------
     result : MclUpdate
-        One per scan. Yin et al. 2020, Sec. III-B.
+        One per scan.
 
     Raises
     ------
     MclError
         If there are too few increments, or a scan is no finite cloud.
+
+    Notes
+    -----
+    Yin et al. 2020, Sec. III-B.
     """
     increments = iter(increments)
     for index, points in enumerate(clouds):
@@ -684,8 +708,10 @@ def localize(
 
 
 def pick_indices(weights: np.ndarray, draws: np.ndarray) -> np.ndarray:
-    """Find draws in [0, 1] on the cumulative weights;
-    a draw beyond their rounded end takes the last positive weight."""
+    """Find the indices of draws in [0, 1] on the cumulative weights.
+
+    A draw beyond their rounded end takes the last positive weight.
+    """
     indices = np.searchsorted(np.cumsum(weights), draws, side="right")
     return np.minimum(indices, np.flatnonzero(weights)[-1])
 

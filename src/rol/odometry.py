@@ -22,8 +22,7 @@ else:  # this file was copied and is imported by its own name
 
 
 class OdometryError(ValueError):
-    """Raised for clouds of a wrong shape or with values that are not finite,
-    and for settings out of their range."""
+    """A cloud or a setting that no registration can use; the message names it."""
 
 
 @dataclass(frozen=True)
@@ -189,7 +188,11 @@ def icp_2d(
     Raises
     ------
     OdometryError
-        If a cloud has another shape or a value that is not finite. Yin et al. 2020, Sec. III-B, below Eq. 7.
+        If a cloud has another shape or a value that is not finite.
+
+    Notes
+    -----
+    Yin et al. 2020, Sec. III-B, below Eq. 7.
     """
     source = check_points(source, "source cloud", error=OdometryError)
     pose = check_pose(init, "initial guess").copy()
@@ -226,7 +229,10 @@ def scan_to_scan_icp(
     result : IcpResult
         One fewer than clouds: the pose of each scan in the one before. Where the registration is impossible
         (an empty cloud, for instance) the increment is the guess and ``n_matched`` is below ``min_matched``.
-        Yin et al. 2020, Sec. III-B.
+
+    Notes
+    -----
+    Yin et al. 2020, Sec. III-B.
     """
     clouds = iter(clouds)
     guess = np.zeros(3) if first_guess is None else check_pose(first_guess, "first guess")
@@ -273,8 +279,7 @@ def cell_index(x):
 
 @compiled
 def _sort(points):
-    """Sort points by cell; return them and the index of the first point of each cell,
-    shape (width^2 + 1,)."""
+    """Sort points by cell; return them and the first index of each cell, shape (width^2 + 1,)."""
     width = 8
     while width * width < 4 * len(points):
         width *= 2
@@ -295,7 +300,7 @@ def _sort(points):
 
 @compiled
 def _count_around(target, enough):
-    """Count the points in the circle, up to ``enough``."""
+    """Count the points of a `SortedCloud` in its circle, up to ``enough``."""
     points, _, (x, y, limit) = target
     n = 0
     for k in range(len(points)):
@@ -307,11 +312,10 @@ def _count_around(target, enough):
 
 @compiled
 def _find_nearest(x, y, target, limit):
-    """Find the nearest point to (x, y); return its index and squared distance,
-    (-1, limit) if none is below the limit.
+    """Find the nearest point to (x, y) below a squared distance; return its index and squared distance.
 
-    Cells of the `SortedCloud` are searched in square rings, until the next ring is too far away or the torus
-    is closed.
+    Without such a point these are -1 and the limit. Cells of the `SortedCloud` are searched in square rings,
+    until the next ring is too far away or the torus is closed.
     """
     points, starts, around = target
     width = np.int64(np.sqrt(len(starts) - 1))
@@ -369,8 +373,7 @@ def _find_closest(squares, fraction):
 
 @compiled
 def _fit_rigid(source, target, rows, matched):
-    """Fit as `fit_rigid` does; row k of the source, of those in ``rows``,
-    is paired with row ``matched[k]`` of the target.
+    """Fit as `fit_rigid` does; source row k, for k in ``rows``, is paired with target row ``matched[k]``.
 
     Returns the motion (x, y, yaw) as a tuple, and whether these source points are not all at one place.
     """

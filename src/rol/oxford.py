@@ -349,8 +349,7 @@ def load_velodyne_binary(path: Path | str) -> np.ndarray:
 
 
 def check_increasing(path: Path | str, stamps: np.ndarray, first_line: int) -> None:
-    """Raise an OxfordError where stamps do not increase;
-    `first_line` is the file's line of the first stamp."""
+    """Raise an OxfordError where stamps do not increase; the first one is in line `first_line`."""
     is_wrong = stamps[1:] <= stamps[:-1]
     if is_wrong.any():
         i = int(np.argmax(is_wrong))
@@ -395,8 +394,7 @@ def column_type(name: str) -> type:
 
 
 def check_table(path: Path | str, table: pd.DataFrame, columns: list[str]) -> None:
-    """Raise an OxfordError for other columns, no row, a value missing or not finite,
-    or times out of order."""
+    """Raise an OxfordError for other columns, no row, values missing or not finite, or unordered times."""
     if list(table.columns) != columns or len(table) == 0:
         fault = f"no rows, or wrong columns (missing: {', '.join(c for c in columns if c not in table) or 'none'})"
         raise OxfordError(f"{path}: {fault}; expected {','.join(columns)}")
@@ -640,8 +638,7 @@ class Session:
         return self.root / "radar" / f"{int(stamp_us)}.png"
 
     def sweep_path(self, sensor: str, stamp_us: int) -> Path:
-        """Return the path of a lidar's sweep, the raw .png or else the .bin;
-        an OxfordError without either."""
+        """Return the path of a lidar's sweep, the .png or else the .bin; an OxfordError without either."""
         if sensor not in LIDARS:
             raise OxfordError(f"{self.root}: no lidar is called {sensor!r}; there are {', '.join(LIDARS)}")
         if (self.left_stamps_us if sensor == "velodyne_left" else self.right_stamps_us) is None:

@@ -340,8 +340,7 @@ class PairSettings:
 
     @classmethod
     def from_dict(cls, values: dict[str, Any]) -> PairSettings:
-        """Take the settings among the entries of a dict, such as the header of weights;
-        defaults for the others."""
+        """Take the settings that a dict holds, such as the header of weights; the others get defaults."""
         return cls(**{field.name: values[field.name] for field in fields(cls) if field.name in values})
 
 

@@ -59,7 +59,11 @@ def scan_to_points(network: TrainedNetwork, scan: Any) -> np.ndarray:
     Returns
     -------
     points : array, shape (n, 2)
-        Points in the radar frame [m]. Yin et al. 2020, Sec. III-A, Eq. 5.
+        Points in the radar frame [m].
+
+    Notes
+    -----
+    Yin et al. 2020, Sec. III-A, Eq. 5.
     """
     settings = PairSettings.from_dict({**network.settings, "motion": "none"})
     image = radar_to_image(scan.power, scan.azimuths, None, settings)
@@ -115,7 +119,10 @@ class RadarLocalizer:
         Returns
         -------
         result : LocalizedScan
-            Yin et al. 2020, Sec. III.
+
+        Notes
+        -----
+        Yin et al. 2020, Sec. III.
         """
         points, increment = scan_to_points(self.network, scan), None
         if self.last_points is not None:

@@ -473,7 +473,7 @@ def generate(
     generator : Generator
         The trained network. The paper's gives the same image in training and in evaluation mode.
     radar_image : array, shape (h, w), uint8
-        Power image of one scan; h and w multiples of 4, and those the network was trained on.
+        Power image of one scan, of the size the network was trained on.
     bf16 : bool
         Compute in bfloat16: quicker where `has_bf16`.
     tta_rotations : int, optional
@@ -487,7 +487,7 @@ def generate(
     Raises
     ------
     Pix2PixError
-        If the image has another type, shape or size, or `tta_rotations` is none of these.
+        If the image has another type, shape or size, or `tta_rotations` is not 1 to 4.
 
     Notes
     -----

@@ -351,8 +351,7 @@ def _prefetch(load: Callable[[int], Any], steps: range, workers: int) -> Iterato
 def _start(
     pairs: Any, config: pix2pix.TrainConfig, seed: int, device: str, hooks: TrainHooks
 ) -> tuple[TrainingState, dict[str, Any]]:
-    """Build the networks of a run and describe it;
-    refuse an empty data set and intervals that do not match."""
+    """Build the networks of a run and describe it; refuse pairs and intervals that cannot be used."""
     if len(pairs) == 0:
         raise TrainingError("no pairs to train on")
     rows, saved = config.report_every, config.checkpoint_every

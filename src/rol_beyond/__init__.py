@@ -1,2 +1,1 @@
-"""What goes beyond the paper and is compared with it: detectors, U-Net, adaptation, motion model,
-global search, recovery."""
+"""Methods beyond the paper: detectors, U-Net, adaptation, motion model, global search, recovery."""

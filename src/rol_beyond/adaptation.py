@@ -137,8 +137,7 @@ def adapt_steps(
     config: AdaptationConfig,
     settings: PairSettings | None = None,
 ) -> Iterator[Generator]:
-    """Fine-tune as `adapt` does, and yield the copy after every step;
-    it is the same object each time."""
+    """Fine-tune as `adapt` does; yield the copy, always the same object, after every step."""
     if len(pairs) == 0:
         raise ValueError("no real pairs to adapt to")
     before, adapted = generator.eval(), copy.deepcopy(generator).eval().requires_grad_(True)

@@ -138,8 +138,7 @@ def apply_gain(power: np.ndarray, gain_db: float) -> np.ndarray:
 
 
 def add_streaks(power: np.ndarray, n: int, rng: np.random.Generator) -> np.ndarray:
-    """Add streaks to a scan: a few neighbouring rows that are bright at all ranges,
-    as after a very strong reflector.
+    """Add streaks to a scan: a few neighbouring rows that are bright at all ranges.
 
     Parameters
     ----------
@@ -340,8 +339,7 @@ class JoinedPairs:
         return part[place]
 
     def draw(self, index: int, *changes: Any) -> tuple[np.ndarray, np.ndarray]:
-        """Return a pair with the changes of `ScanPairs.draw`: turn, gain, streaks,
-        ghosts and their generator."""
+        """Return a pair with the changes that `ScanPairs.draw` names: turn, gain, streaks and ghosts."""
         part, place = self._find(index)
         return part.draw(place, *changes)
 

@@ -1,4 +1,4 @@
-"""Consistency of covariances with errors (NEES)."""
+"""Consistency of covariances with the errors (NEES)."""
 
 from __future__ import annotations
 

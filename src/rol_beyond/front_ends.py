@@ -1,5 +1,4 @@
-"""Front ends: from a polar radar scan to points by a network or by a peak detector,
-and their evaluation on a map.
+"""Front ends: from a polar radar scan to points by a network or a peak detector, and their evaluation.
 
 All points are in the radar frame, x forward, y left [m], at mid-scan if a twist is given. Detectors and
 networks get the same scan and the same motion, so that their points can be compared.

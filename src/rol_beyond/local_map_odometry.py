@@ -510,8 +510,7 @@ class LocalMapOdometry:
         self._add_keyframe(cloud)
 
     def _map_at(self, twist: np.ndarray) -> LocalMap | None:
-        """Give the local map; while it is one cloud of uncertain velocity,
-        deskew that cloud with this one."""
+        """Return the local map; deskew it with this velocity while it is one cloud of uncertain velocity."""
         if self.anchor is None:
             return self.local_map
         return build_local_map([self._place(*self.anchor, twist)], self.settings.map)
@@ -564,8 +563,7 @@ def _check_stamps(stamps_us: np.ndarray) -> np.ndarray:
 
 @compiled
 def information_matrices(cloud, radius, ratio, along_weight):
-    """Compute the information matrix of each map point from the shape of its surroundings,
-    shape (n, 2, 2)."""
+    """Compute information matrices, shape (n, 2, 2), of map points from the shape of their surroundings."""
     matrices = np.empty((len(cloud.points), 2, 2))
     for k in range(len(matrices)):
         n, xx, yy, xy = _spread_about(cloud, cloud.points[k], radius, 12)
@@ -580,8 +578,7 @@ def information_matrices(cloud, radius, ratio, along_weight):
 
 @compiled
 def _spread_about(target, centre, radius, most):
-    """Compute number, variances and covariance (n, xx, yy, xy) of the ``most`` nearest points within a
-    radius."""
+    """Compute (n, xx, yy, xy): number and covariance of the ``most`` nearest points within a radius."""
     near, n, x, y, xx, yy, xy = _find_near(target, centre, radius), 0, 0.0, 0.0, 0.0, 0.0, 0.0
     bound = np.partition(near[:, 2], most - 1)[most - 1] if len(near) > most else np.inf
     for k in range(len(near)):

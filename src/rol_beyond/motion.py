@@ -15,13 +15,16 @@ import numpy as np
 
 from rol.geometry import check_fields, check_pose, check_poses, wrap_angle
 
+# Largest change between increments at 4 Hz, forward and in heading [m, rad]: an acceleration of 10 m/s2, full
+# braking, and more than twice the change at the entry of a bend.
+MAX_CHANGE = (0.6, np.deg2rad(2.5))
+PATIENCE = 3  # after so many rejected increments in a row the next one is accepted: the reference was wrong
 MIN_SIGMAS = (0.02, 0.01, np.deg2rad(0.1))  # of a stationary vehicle, which may creep [m, m, rad]
 
 
 @dataclass(frozen=True)
 class MotionModel:
-    """Distribution of the true increment given a measured one; the defaults take the odometry as it is,
-    with wide noise.
+    """Distribution of the true increment given a measured one; by default the odometry with wide noise.
 
     A `rol.mcl.MclSettings.motion`. Yin et al. 2020, Sec. III-B, Eq. 7, with calibrated noise.
 
@@ -163,8 +166,7 @@ def calibrate_motion(
 
 
 def _fit_stationary(increments: np.ndarray, truth: np.ndarray) -> np.ndarray:
-    """Fit a diagonal matrix to increments of a stationary vehicle;
-    the identity where there are fewer than 20."""
+    """Fit a diagonal matrix to increments of a stationary vehicle; the identity for fewer than 20."""
     if len(increments) < 20:
         return np.eye(3)
     return np.diag(np.sum(increments * truth, axis=0) / np.maximum(np.sum(increments**2, axis=0), 1e-12))
@@ -177,8 +179,7 @@ def _find_outliers(increments: np.ndarray, truth: np.ndarray) -> np.ndarray:
 
 
 def _fit_noise(errors: np.ndarray, length: np.ndarray, stationary: np.ndarray) -> list[tuple[float, ...]]:
-    """Fit the three standard deviations of the model;
-    `stationary` is the stationary fraction of each window."""
+    """Fit the standard deviations of the model; `stationary` is a fraction of each window."""
 
     def spread(chosen: np.ndarray, otherwise: np.ndarray) -> np.ndarray:
         return np.sqrt(np.mean(errors[chosen] ** 2, axis=0)) if chosen.sum() > 4 else otherwise
@@ -201,25 +202,13 @@ def _window_sums(values: np.ndarray, window: int) -> np.ndarray:
     return (sums[window:] - sums[:-window])[:: max(window // 2, 1)]
 
 
-def gate_odometry(
-    increments: Iterable[np.ndarray],
-    *,
-    max_change: tuple[float, float] = (0.6, np.deg2rad(2.5)),
-    patience: int = 3,
-) -> Iterator[np.ndarray]:
+def gate_odometry(increments: Iterable[np.ndarray]) -> Iterator[np.ndarray]:
     """Replace implausible increments by the last plausible one.
 
     Parameters
     ----------
     increments : iterable of array, shape (3,)
-        Odometry at a constant rate [m, m, rad].
-    max_change : tuple of float
-        Largest change from one increment to the next, forward [m] and in heading [rad]. At 4 Hz 0.6 m
-        correspond to an acceleration of 10 m/s2, full braking, and 2.5 deg are more than twice the change at
-        the entry of a bend.
-    patience : int
-        After this number of rejected increments in a row the next one is accepted: then the reference was
-        wrong.
+        Odometry at 4 Hz [m, m, rad].
 
     Yields
     ------
@@ -229,9 +218,9 @@ def gate_odometry(
     last, n_rejected = None, 0
     for increment in increments:
         increment = check_pose(increment, "odometry increment")
-        if last is not None and n_rejected < patience:
+        if last is not None and n_rejected < PATIENCE:
             change = abs(increment[0] - last[0]), abs(float(wrap_angle(increment[2] - last[2])))
-            if change[0] > max_change[0] or change[1] > max_change[1]:
+            if change[0] > MAX_CHANGE[0] or change[1] > MAX_CHANGE[1]:
                 n_rejected += 1
                 yield last.copy()
                 continue

@@ -14,8 +14,9 @@ from rol_beyond.recovery import RecoveringFilter
 
 
 class RobustLocalizer:
-    """Localize radar scans on a lidar map, one at a time, with recovery;
-    has the ``step`` of `rol.pipeline.RadarLocalizer`.
+    """Localize radar scans on a lidar map, one at a time, with recovery.
+
+    It has the ``step`` of `rol.pipeline.RadarLocalizer`.
 
     Parameters
     ----------

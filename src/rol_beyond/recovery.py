@@ -1,5 +1,4 @@
-"""Localization that detects when it is lost, reports it,
-and relocalizes without ground truth or manual resets.
+"""Localization that detects and reports when it is lost, and relocalizes without manual resets.
 
 Two tests are made with every scan. First, does the scan match better at the estimate than by chance? The
 score contrast (`rol_beyond.search.score_contrast`), averaged over two seconds, is normalized by its value at
@@ -314,8 +313,7 @@ class Hypotheses:
     def update(
         self, points: np.ndarray, grid: MapGrid, exponent: float, rng: np.random.Generator
     ) -> tuple[Hypotheses, np.ndarray]:
-        """Weight and resample the particles of each by one scan; return the score contrasts, too,
-        shape (h,)."""
+        """Weight and resample the particles of each by one scan; also return the score contrasts (h,)."""
         if not len(self) or not len(points):
             return self, np.zeros(len(self))
         h, k, _ = self.particles.shape
@@ -343,8 +341,7 @@ class Hypotheses:
         return self.keep(np.array(sorted(kept)[1:], dtype=int) - 1)
 
     def add(self, found: np.ndarray, pose: np.ndarray, n: int, rng: np.random.Generator) -> Hypotheses:
-        """Add poses that are neither the estimate nor a hypothesis yet, up to n in all;
-        the worst old ones go."""
+        """Add new poses, up to n in all, in place of the worst; not the estimate, nor known hypotheses."""
         known = np.vstack([pose[None], self.poses])
         away = np.abs(found[:, None] - known[None])
         away[..., 2] = np.abs(wrap_angle(away[..., 2]))
@@ -602,8 +599,7 @@ class RecoveringFilter(ParticleFilter):
         return best if leads[best] > 0.0 else None
 
     def _find_winner(self) -> int | None:
-        """Find the hypothesis that replaces the estimate, if any: confirmed, better, unique,
-        and with a high score."""
+        """Find the hypothesis that replaces the estimate: confirmed, better, unique, with a high score."""
         limits, leader = self.recovery.confirmation, self._find_leader()
         if leader is None or self.hypotheses.ages[leader] < limits.n_scans:
             return None
@@ -629,8 +625,7 @@ class RecoveringFilter(ParticleFilter):
         self.is_far, self.is_trusted, self.n_lost, self.high_score_m = False, False, 0, 0.0
 
     def _is_search_due(self) -> bool:
-        """Check the pause since the last search, the number of scans,
-        and the distance before a far search."""
+        """Check pause and number of scans since the last search, and the distance before a far search."""
         settings, detection = self.recovery.relocalization, self.recovery.detection
         pause = settings.trusted_pause if self.is_trusted else settings.pause
         pause = settings.far_pause if self.is_far else pause

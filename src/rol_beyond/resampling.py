@@ -9,6 +9,10 @@ import numpy as np
 from rol.geometry import check_fields
 from rol.mcl import MclError, check_weights, pick_indices, resample_multinomial
 
+BIN = (0.25, 0.25, np.deg2rad(2.0))  # of the histogram of the belief: x, y, yaw [m, m, rad]
+KL_BOUND = 0.05  # on the Kullback-Leibler distance between the belief and the particles
+QUANTILE = 2.33  # of the standard normal distribution: the bound holds with a probability of 99 %
+
 
 @dataclass(frozen=True)
 class KldResampling:
@@ -71,37 +75,28 @@ def resample_systematic(weights: np.ndarray, rng: np.random.Generator, n: int | 
     return pick_indices(check_weights(weights), (np.arange(n) + rng.random()) / n)
 
 
-def kld_sample_size(
-    particles: np.ndarray,
-    *,
-    cell_m: float = 0.25,
-    cell_yaw: float = np.deg2rad(2.0),
-    error: float = 0.05,
-    quantile: float = 2.33,
-) -> int:
+def kld_sample_size(particles: np.ndarray) -> int:
     """Compute the number of particles that represents a belief with the spread of these.
 
     Parameters
     ----------
     particles : array, shape (n, 3)
         Particles of equal weight (x, y, yaw) [m, m, rad].
-    cell_m, cell_yaw : float
-        Sides of the bins of the belief's histogram [m, rad].
-    error : float
-        Bound on the Kullback-Leibler distance between the belief and its representation by particles.
-    quantile : float
-        Of the standard normal distribution: 2.33 keeps the bound with a probability of 99 %.
 
     Returns
     -------
     n : int
-        At least one. Fox 2003, "Adapting the sample size in particle filters through KLD-sampling", Eq. 7.
+        At least one.
+
+    Notes
+    -----
+    Fox 2003, "Adapting the sample size in particle filters through KLD-sampling", Eq. 7.
     """
-    cells = np.floor(particles / (cell_m, cell_m, cell_yaw)).astype(np.int64)
+    cells = np.floor(particles / BIN).astype(np.int64)
     cells -= cells.min(axis=0)
     sides = cells.max(axis=0) + 1
     k = len(np.unique((cells[:, 0] * sides[1] + cells[:, 1]) * sides[2] + cells[:, 2])) - 1
     if k == 0:
         return 1
     part = 2.0 / (9.0 * k)
-    return int(np.ceil(k / (2.0 * error) * (1.0 - part + np.sqrt(part) * quantile) ** 3))
+    return int(np.ceil(k / (2.0 * KL_BOUND) * (1.0 - part + np.sqrt(part) * QUANTILE) ** 3))

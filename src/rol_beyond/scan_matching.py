@@ -167,11 +167,7 @@ def scan_to_map_icp(
 
 
 def _crop_target(
-    source: np.ndarray,
-    target: np.ndarray,
-    guess: np.ndarray,
-    window: tuple[float, float, float],
-    cell: float,
+    source: np.ndarray, target: np.ndarray, guess: np.ndarray, window: tuple[float, float, float], cell: float
 ) -> np.ndarray:
     """Discard target points too far from the source; raise if the rest is too wide for a grid."""
     longest = np.hypot(*source.T).max() + 1.2 * np.hypot(*window[:2]) + 4.0 * cell

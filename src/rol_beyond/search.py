@@ -18,17 +18,12 @@ import numpy as np
 from scipy import fft
 from scipy.spatial import cKDTree
 
-from rol.geometry import (
-    check_fields,
-    check_grid,
-    check_pose,
-    compose,
-    invert,
-    transform_points,
-    wrap_angle,
-)
+from rol.geometry import check_fields, check_grid, check_pose, compose, invert, transform_points, wrap_angle
 from rol.mcl import MapGrid, count_matches
 
+SAME_M = 0.35  # a point this close to one of another scan has kept its place in the radar frame
+MOVED_M = 0.3  # scans from positions closer to each other are not compared
+N_BY_CHANCE = 1  # of the four neighbouring scans a point may coincide with so many
 OTHER_HEADINGS = np.deg2rad(np.arange(20.0, 341.0, 20.0))  # relative to a pose; points match there by chance
 
 
@@ -99,12 +94,7 @@ def merge_clouds(clouds: Sequence[np.ndarray], increments: Sequence[np.ndarray])
 
 
 def remove_ego_static_points(
-    clouds: Sequence[np.ndarray],
-    increments: Sequence[np.ndarray],
-    *,
-    radius_m: float = 0.35,
-    moved_m: float = 0.3,
-    n_allowed: int = 1,
+    clouds: Sequence[np.ndarray], increments: Sequence[np.ndarray]
 ) -> list[np.ndarray]:
     """Remove points that keep their place in the radar frame while the vehicle moves.
 
@@ -114,12 +104,6 @@ def remove_ego_static_points(
         Clouds of successive scans, each in its own frame [m].
     increments : sequence of array, shape (3,)
         Motion between them, one fewer than clouds [m, m, rad].
-    radius_m : float
-        A point has kept its place when another scan has a point this close, in the radar frame [m].
-    moved_m : float
-        Scans from positions closer to each other than this are not compared [m].
-    n_allowed : int
-        Number of the four neighbouring scans in which a point may coincide by chance.
 
     Returns
     -------
@@ -132,9 +116,9 @@ def remove_ego_static_points(
     for i, cloud in enumerate(clouds):
         n_same = np.zeros(len(cloud), dtype=int)
         for j in (i - 2, i - 1, i + 1, i + 2):
-            if 0 <= j < len(clouds) and abs(driven[j] - driven[i]) > moved_m and len(cloud):
-                n_same += trees[j].query(cloud, distance_upper_bound=radius_m)[0] < radius_m
-        kept.append(cloud[n_same <= n_allowed])
+            if 0 <= j < len(clouds) and abs(driven[j] - driven[i]) > MOVED_M and len(cloud):
+                n_same += trees[j].query(cloud, distance_upper_bound=SAME_M)[0] < SAME_M
+        kept.append(cloud[n_same <= N_BY_CHANCE])
     return kept
 
 
@@ -312,8 +296,7 @@ def _refine(
 def suppress_neighbours(
     poses: np.ndarray, order: np.ndarray, n: int, separation: tuple[float, float]
 ) -> list[int]:
-    """Go through poses in an order and keep those that are not close to one kept before
-    (non-maximum suppression).
+    """Keep the poses, in an order, that are not close to one kept before (non-maximum suppression).
 
     Parameters
     ----------

@@ -70,8 +70,7 @@ def _weighted_mean(losses: Tensor, lidar: Tensor, pos_weight: float) -> Tensor:
 
 @dataclass(frozen=True)
 class TrainingExtensions:
-    """Departures from the paper's training, as hooks of `rol.training.train`;
-    the defaults are the paper's."""
+    """Options beyond the paper's training, as hooks of `rol.training.train`; the defaults are the paper's."""
 
     architecture: str = "resnet"  # of the generator, see `rol.pix2pix.build_generator`
     adversarial: bool = True  # False: no discriminator, the pixel loss alone

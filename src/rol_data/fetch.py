@@ -27,8 +27,7 @@ class FetchError(RuntimeError):
 
 
 def load_list(path: Path) -> list[dict]:
-    """Read the list of repositories, each with its commit, terms,
-    size [bytes] and the SHA-256 of every file."""
+    """Read the list of repositories: commit, terms, size [bytes], SHA-256 of every file."""
     return json.loads(path.read_text(encoding="utf-8"))["repositories"]
 
 
@@ -75,8 +74,7 @@ def make_clone(clone: Path, url: str, commit: str) -> None:
 
 
 def fetch_files(clone: Path, commit: str, names: list[str], digests: dict[str, str], folder: Path) -> None:
-    """Check some files out of a clone, compare their checksums,
-    and move them into the folder of the repository.
+    """Check files out of a clone, compare their checksums, and move them into the repository's folder.
 
     Raises
     ------

@@ -208,7 +208,6 @@ def radar_from_lidar() -> np.ndarray:
 
 
 def load_kaist_map(real_root: Path | str) -> np.ndarray:
-    """Read RaLL's map of KAIST, shape (n, 2) [m];
-    a `rol_data.rall.RallError` if it is missing or at fault."""
+    """Read RaLL's map of KAIST, shape (n, 2) [m]; a fault raises `rol_data.rall.RallError`."""
     points = rall.load_map_points(Path(real_root) / KAIST_MAP_PATH, KAIST_SHAPE)
     return points + (np.array(KAIST_CORNER) - rall.MAP_CORNER)

@@ -1,5 +1,4 @@
-"""Read real pairs of a radar scan and a lidar sweep from RADIATE,
-a data set in bad weather (Sheeny et al. 2021).
+"""Read pairs of a radar scan and a lidar sweep from RADIATE, recorded in bad weather (Sheeny et al. 2021).
 
 The small sample that comes with its SDK holds 18 consecutive scans of a CTS350-X, the paper's radar, and the
 nearest sweep of an HDL-32E, the paper's lidar, in fog. The radar's files differ from Oxford's: bins four

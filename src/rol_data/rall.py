@@ -71,8 +71,7 @@ class Place:
 
 
 def _mulran(name: str, shape: tuple[int, int], corner: tuple[float, float]) -> Place:
-    """Describe a place of MulRan; the names of its odometry files begin with a capital letter,
-    or are an acronym."""
+    """Describe a place of MulRan; the names of its odometry files are capitalized."""
     title = name.upper() if name == "dcc" else name.capitalize()
     path = Path(f"RaLL/data/maps/MulRan/png/laser_map_{name}.png")
     poses = f"RaLL/data/gt_poses/MulRan/pose_{name}_{{}}.txt"

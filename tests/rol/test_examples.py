@@ -137,17 +137,31 @@ def run_examples(folders: Iterable[Path], packages: Iterable[str]) -> list[str]:
     return answer.stdout.split(END)[:-1]
 
 
-def copy_files(names: Iterable[str], folder: Path) -> None:
-    """Copy files of the package."""
-    folder.mkdir(parents=True, exist_ok=True)
+def copy_files(names: Iterable[str], folder: Path, compiled: Path) -> None:
+    """Copy files of the package into a new folder, whose cache of compiled functions is that of other copies.
+
+    numba knows a copy by the name, size and time of the file, and by the name of the module.
+    """
+    folder.mkdir(parents=True)
+    compiled.mkdir(exist_ok=True)
+    (folder / "__pycache__").symlink_to(compiled)
     for name in names:
-        shutil.copy(PACKAGE / name, folder)
+        shutil.copy2(PACKAGE / name, folder)
 
 
 def code_blocks(page: Path, section: str) -> list[tuple[str, str]]:
     """Give language and text of the code blocks of a section of the second level."""
     text = page.read_text(encoding="utf-8").partition(f"\n## {section}\n")[2].partition("\n## ")[0]
     return re.findall(r"^```(\w+)\n(.*?)^```$", text, re.MULTILINE | re.DOTALL)
+
+
+@pytest.fixture(scope="module")
+def compiled(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Folder of the caches of compiled functions, one for all processes that run tests."""
+    base = tmp_path_factory.getbasetemp()
+    folder = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "compiled"
+    folder.mkdir(exist_ok=True)
+    return folder
 
 
 # ---- each file ------------------------------------------------------------------------------------------------
@@ -160,14 +174,14 @@ def test_every_module_has_an_example() -> None:
 
 @pytest.mark.parametrize("group", GROUPS, ids="-".join)
 def test_examples_run_flat_and_as_a_package_with_what_the_page_names(
-    group: list[str], tmp_path: Path
+    group: list[str], tmp_path: Path, compiled: Path
 ) -> None:
     expected = {}
     for name in group:
         files, example = [f"{name}.py", *EXAMPLES[name].files], EXAMPLES[name]
-        package = tmp_path / name / "tools"
-        copy_files(files, package)  # the same files for both, so that numba compiles them once
-        for folder, code in ((package, example.code), (package.parent, example.code_for_package)):
+        for kind, below, code in (("flat", "", example.code), ("package", "tools", example.code_for_package)):
+            folder = tmp_path / name / kind
+            copy_files(files, folder / below, compiled / kind)
             (folder / "example.py").write_text(code, encoding="utf-8")
             expected[folder] = example.printed
     printed = run_examples(expected, set.union(*(EXAMPLES[name].packages for name in group)))

@@ -1,11 +1,5 @@
 """The filter's pieces, each with numbers worked out by hand or against a slow oracle."""
 
-import os
-import shutil
-import subprocess
-import sys
-from pathlib import Path
-
 import numpy as np
 import pytest
 from scipy.ndimage import distance_transform_edt
@@ -16,14 +10,7 @@ from rol.geometry import transform_points
 
 # 5 x 5 cells of 1 m: a wall along x = 2.5 (row 2) and a post at (4.5, 0.5); first axis x, second axis y
 MATCHED = np.array(
-    [
-        [0, 0, 0, 0, 0],
-        [0, 0, 0, 0, 0],
-        [1, 1, 1, 1, 1],
-        [0, 0, 0, 0, 0],
-        [1, 0, 0, 0, 0],
-    ],
-    dtype=np.uint8,
+    [[0, 0, 0, 0, 0], [0, 0, 0, 0, 0], [1, 1, 1, 1, 1], [0, 0, 0, 0, 0], [1, 0, 0, 0, 0]], dtype=np.uint8
 )
 CLOUD = np.array([[2.0, 0.0], [2.0, 1.0], [4.0, -2.0]])  # two wall points ahead, the post ahead to the right
 ORIGIN = np.zeros(2)
@@ -328,24 +315,6 @@ def test_localize_is_online():
 def test_more_clouds_than_increments_is_an_error():
     with pytest.raises(mcl.MclError, match="no odometry increment for scan 2"):
         wall_filter([np.zeros((0, 2))] * 3, [(0.0, 0.0, 0.0)])
-
-
-def test_the_file_works_copied_alone(tmp_path):
-    source = Path(mcl.__file__).parent
-    for name in ("mcl.py", "compiled.py", "geometry.py"):
-        shutil.copy(source / name, tmp_path)
-    code = (
-        "import numpy as np, mcl;"
-        "g = mcl.build_matched_grid(np.array([[5.0, 0.0], [5.0, 1.0]]));"
-        "c = np.array([[5.0, 0.1], [3.0, 0.0]]);"
-        "print(mcl.count_matches(np.zeros((1, 3)), c, g)[0])"
-    )
-    done = subprocess.run(
-        [sys.executable, "-W", "error", "-c", code], cwd=tmp_path, capture_output=True, text=True, check=False,
-        env={k: v for k, v in os.environ.items() if k != "PYTHONPATH"},
-    )  # fmt: skip
-    assert done.returncode == 0, done.stderr
-    assert done.stdout.strip() == "1" and done.stderr == ""
 
 
 def test_defaults_are_the_documented_ones():

@@ -1,5 +1,6 @@
 """The loop learns, repeats itself to the last bit, goes on where it stopped, and refuses what it must."""
 
+import shutil
 from collections.abc import Iterator
 from dataclasses import replace
 from functools import partial
@@ -13,7 +14,7 @@ import pytest
 torch = pytest.importorskip("torch")
 
 from rol import training
-from rol.pix2pix import TrainConfig, build_generator, load_tensors, load_weights, save_tensors
+from rol.pix2pix import Generator, TrainConfig, build_generator, load_tensors, load_weights, save_tensors
 from rol.training import RunOptions, TrainHooks, TrainingError, batch_indices, learning_rate, train
 
 pytestmark = pytest.mark.torch
@@ -30,6 +31,19 @@ def make_pairs(n: int = 5, size: int = 32, seed: int = 7) -> list[tuple[np.ndarr
         radar[0, row - 1 : row + 2], radar[0, :, col - 1 : col + 2] = 0.2, 0.2
         pairs.append((np.clip(radar + rng.normal(0, 0.1, radar.shape), -1, 1).astype(np.float32), lidar))
     return pairs
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Generator, pd.DataFrame]:
+    """Folder, network and history of a training that ran to its end."""
+    folder, options = tmp_path_factory.mktemp("finished"), RunOptions(metadata={"session": "s"})
+    return folder, *train(make_pairs(), TINY, folder, seed=1, options=options)
+
+
+@pytest.fixture
+def copy(finished: tuple, tmp_path: Path) -> Path:
+    """A copy of that folder."""
+    return Path(shutil.copytree(finished[0], tmp_path / "copy"))
 
 
 def test_rate_is_constant_for_half_the_run_and_then_falls_in_a_straight_line() -> None:
@@ -69,7 +83,7 @@ def test_same_seed_gives_the_same_losses_and_another_seed_others(tmp_path: Path)
     assert files[0] == files[1]
 
 
-@pytest.mark.parametrize("stop_at", [2, 4, 7, 11])
+@pytest.mark.parametrize("stop_at", [4, 11])
 def test_stopped_run_goes_on_to_the_same_bits(tmp_path: Path, stop_at: int) -> None:
     def stop(row: dict, generator: torch.nn.Module) -> None:
         if row["step"] == stop_at:
@@ -96,7 +110,7 @@ def test_stopped_run_goes_on_to_the_same_bits(tmp_path: Path, stop_at: int) -> N
         assert (tmp_path / "whole" / file).read_bytes() == (tmp_path / "stopped" / file).read_bytes()
 
 
-@pytest.mark.parametrize(("last_look", "saved_step"), [(4, 2), (7, 4), (8, 4), (10, 6)])
+@pytest.mark.parametrize(("last_look", "saved_step"), [(4, 2), (10, 6)])
 def test_checkpoints_by_time_within_a_row_lead_to_the_same_bits(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, last_look: int, saved_step: int
 ) -> None:
@@ -142,70 +156,52 @@ def test_a_stop_between_the_last_step_and_its_row_keeps_the_row(tmp_path: Path) 
     pd.testing.assert_frame_equal(whole, again, check_exact=True)
 
 
-def test_finished_run_is_only_read_again(tmp_path: Path) -> None:
-    first = train(make_pairs(), TINY, tmp_path, seed=1)[1]
+def test_finished_run_is_only_read_again(finished: tuple, copy: Path) -> None:
     rows = []
-    second = train(
-        make_pairs(), TINY, tmp_path, seed=1, hooks=TrainHooks(on_report=lambda row, _: rows.append(row))
-    )[1]
+    hooks = TrainHooks(on_report=lambda row, _: rows.append(row))
+    again = train(make_pairs(), TINY, copy, seed=1, hooks=hooks)[1]
     assert rows == []
-    pd.testing.assert_frame_equal(first, second, check_exact=True)
+    pd.testing.assert_frame_equal(finished[2], again, check_exact=True)
 
 
-def test_files_hold_what_was_done(tmp_path: Path) -> None:
-    generator, history = train(
-        make_pairs(), TINY, tmp_path, seed=1, options=RunOptions(metadata={"session": "s"})
-    )
-    about = load_tensors(tmp_path / "generator.safetensors")[1]
+def test_files_hold_what_was_done(finished: tuple) -> None:
+    folder, generator, history = finished
+    about = load_tensors(folder / "generator.safetensors")[1]
     assert (about["session"], about["seed"], about["step"], about["pairs"]) == ("s", 1, 12, 5)
     assert about["config"]["lambda_l1"] == 100.0 and about["image_size"] == [32, 32]
-    assert load_weights(tmp_path / "generator.safetensors").image_size == generator.image_size == (32, 32)
-    stored = pd.read_csv(tmp_path / "history.csv")
+    assert load_weights(folder / "generator.safetensors").image_size == generator.image_size == (32, 32)
+    stored = pd.read_csv(folder / "history.csv")
     pd.testing.assert_frame_equal(stored, history, rtol=1e-14)
     assert stored["held_out_l1"].isna().all()
-    names = sorted(path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*") if path.is_file())
+    names = sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file())
     assert names == ["checkpoint/last.safetensors", "generator.safetensors", "history.csv"]
 
 
-@pytest.mark.parametrize(
-    ("change", "fault"),
-    [
+def test_checkpoint_of_another_run_is_refused_unless_told_to_start_anew(copy: Path) -> None:
+    arguments = {"pairs": make_pairs(), "config": TINY, "out_dir": copy, "seed": 1}
+    for change, fault in (
         ({"hooks": TrainHooks(settings={"pos_weight": 2.0})}, "pos_weight was None, now 2.0"),
         ({"config": replace(TINY, lambda_l1=5.0)}, "lambda_l1 was 100.0, now 5.0"),
         ({"seed": 2}, "seed was 1, now 2"),
         ({"pairs": make_pairs(4)}, "pairs was 5, now 4"),
         ({"pairs": make_pairs(5, seed=9)}, "data was"),
-    ],
-)
-def test_checkpoint_of_another_run_is_refused_unless_told_to_start_anew(
-    tmp_path: Path, change: dict, fault: str
-) -> None:
-    arguments = {"pairs": make_pairs(), "config": TINY, "out_dir": tmp_path, "seed": 1}
-    train(**arguments)
-    with pytest.raises(TrainingError, match=f"last.safetensors: is of another run: {fault}"):
-        train(**(arguments | change))
-    assert len(train(**(arguments | change), options=RunOptions(resume=False))[1]) == 12
+    ):
+        with pytest.raises(TrainingError, match=f"last.safetensors: is of another run: {fault}"):
+            train(**(arguments | change))
+    assert len(train(**(arguments | {"seed": 2}), options=RunOptions(resume=False))[1]) == 12
 
 
-def test_truncated_checkpoint_is_refused(tmp_path: Path) -> None:
-    train(make_pairs(), TINY, tmp_path, seed=1)
-    path = tmp_path / "checkpoint" / "last.safetensors"
+def test_damaged_checkpoint_is_refused(copy: Path) -> None:
+    path = copy / "checkpoint" / "last.safetensors"
+    tensors, about = load_tensors(path)
     path.write_bytes(path.read_bytes()[:-100])
     with pytest.raises(ValueError, match="last.safetensors: not a whole safetensors file"):
-        train(make_pairs(), TINY, tmp_path, seed=1)
-
-
-@pytest.mark.parametrize("part", ["generator.", "adam.discriminator.", "history"])
-def test_checkpoint_without_a_part_is_refused(tmp_path: Path, part: str) -> None:
-    train(make_pairs(), TINY, tmp_path, seed=1)
-    path = tmp_path / "checkpoint" / "last.safetensors"
-    tensors, about = (
-        {name: value for name, value in content.items() if not name.startswith(part)}
-        for content in load_tensors(path)
-    )
-    save_tensors(path, tensors, about)
-    with pytest.raises(TrainingError, match="last.safetensors: not a whole checkpoint"):
-        train(make_pairs(), TINY, tmp_path, seed=1)
+        train(make_pairs(), TINY, copy, seed=1)
+    for part in ("generator.", "adam.discriminator.", "history"):
+        kept = ({k: v for k, v in content.items() if not k.startswith(part)} for content in (tensors, about))
+        save_tensors(path, *kept)
+        with pytest.raises(TrainingError, match="last.safetensors: not a whole checkpoint"):
+            train(make_pairs(), TINY, copy, seed=1)
 
 
 def test_loss_that_is_not_finite_names_the_step_and_leaves_the_checkpoint(tmp_path: Path) -> None:
@@ -232,34 +228,6 @@ def generator_alone(config: TrainConfig, rng: torch.Generator) -> dict[str, torc
     return {"generator": build_generator(config.ngf, config.n_blocks, rng=rng)}
 
 
-def draw_turned(pairs: list, index: np.ndarray, rng: np.random.Generator) -> list:
-    """Turn both images of each pair by quarters."""
-    return [
-        tuple(np.ascontiguousarray(np.rot90(image, rng.integers(4), (1, 2))) for image in pairs[i])
-        for i in index
-    ]
-
-
-def test_drawn_pairs_depend_on_seed_and_step_alone(tmp_path: Path) -> None:
-    config, pairs = replace(TINY, batch_size=2), make_pairs(6)
-    hooks = TrainHooks(generator_alone, draw_batch=draw_turned)
-    whole = train(pairs, config, tmp_path / "whole", seed=1, options=RunOptions(num_workers=3), hooks=hooks)[
-        1
-    ]
-    plain = train(pairs, config, tmp_path / "plain", seed=1, hooks=TrainHooks(generator_alone))[1]
-    assert not np.allclose(whole["loss_l1"], plain["loss_l1"])
-    assert whole["loss_gan"].isna().all()
-
-    def stop(row: dict, generator: object) -> None:
-        if row["step"] == 6:
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        train(pairs, config, tmp_path / "again", seed=1, hooks=replace(hooks, on_report=stop))
-    again = train(pairs, config, tmp_path / "again", seed=1, hooks=hooks)[1]
-    pd.testing.assert_frame_equal(whole, again, check_exact=True)
-
-
 def test_files_of_a_batch_are_named_when_a_gradient_is_not_finite(tmp_path: Path) -> None:
     pairs = Named(make_pairs(3))
     pairs[1] = (np.full_like(pairs[1][0], np.inf), pairs[1][1])
@@ -280,14 +248,6 @@ def test_runs_that_cannot_be_are_refused(
 ) -> None:
     with pytest.raises(ValueError, match=fault):
         train(pairs, config, tmp_path, seed=1)
-
-
-def test_checkpoint_of_other_hooks_is_refused(tmp_path: Path) -> None:
-    train(make_pairs(), TINY, tmp_path, seed=1, hooks=TrainHooks(settings={"pos_weight": 9.0}))
-    with pytest.raises(
-        TrainingError, match="last.safetensors: is of another run: pos_weight was 9.0, now None"
-    ):
-        train(make_pairs(), TINY, tmp_path, seed=1)
 
 
 @pytest.mark.parametrize(

@@ -54,23 +54,17 @@ def test_the_real_scans_are_localized_from_five_metres_off(real_root: Path) -> N
     scans, map_points = rall.load_scans(real_root), rall.load_map_points(real_root / rall.MAP_PATH)
     truth = np.array([scan.pose for scan in scans])
     near_map = map_points[np.hypot(*(map_points - truth[0, :2]).T) < 150.0]
-    network, known = load_network(WEIGHTS / "unet.safetensors"), {}
+    network = load_network(WEIGHTS / "unet.safetensors")
 
     def front_end(scan: rall.RealScan) -> np.ndarray:
-        if scan.stamp_us not in known:
-            known[scan.stamp_us] = generate_points(network, scan.power, scan.azimuths)[0]
-        return known[scan.stamp_us]
+        return generate_points(network, scan.power, scan.azimuths)[0]
 
-    sigmas, spread = (
-        (0.1, 0.05, np.deg2rad(0.3)),
-        {"start_spread_m": 4.0, "start_spread_yaw_rad": np.deg2rad(4.0)},
-    )
+    sigmas = (0.1, 0.05, np.deg2rad(0.3))
+    spread = {"start_spread_m": 4.0, "start_spread_yaw_rad": np.deg2rad(4.0)}
     motion = MotionModel(sigma_stationary=sigmas, sigma_base=sigmas, sigma_per_metre=(0.03, 0.03, 0.0))
     settings = settings_for("robust", n_particles=40_000, max_particles=5000, motion=motion, **spread)
-    for angle, sign in ((0.0, 1.0), (np.pi / 2.0, -1.0), (np.pi, 1.0)):
-        offset = np.array([5.0 * np.cos(angle), 5.0 * np.sin(angle), sign * np.deg2rad(5.0)])
-        start, rng = compose(truth[0], offset), np.random.default_rng(1)
-        robust_filter = RecoveringFilter(near_map, start, settings, RecoverySettings(0.239), rng)
-        localizer = RobustLocalizer(robust_filter, front_end, density_radius_m=2.0)
-        x, y, yaw = relative_pose(truth, np.array([localizer.step(scan).pose for scan in scans])).T
-        assert np.hypot(x, y)[3:].max() < 0.6 and np.rad2deg(np.abs(yaw))[3:].max() < 0.6
+    start, rng = compose(truth[0], (0.0, 5.0, np.deg2rad(-5.0))), np.random.default_rng(1)
+    robust_filter = RecoveringFilter(near_map, start, settings, RecoverySettings(0.239), rng)
+    localizer = RobustLocalizer(robust_filter, front_end, density_radius_m=2.0)
+    x, y, yaw = relative_pose(truth, np.array([localizer.step(scan).pose for scan in scans])).T
+    assert np.hypot(x, y)[3:].max() < 0.6 and np.rad2deg(np.abs(yaw))[3:].max() < 0.6

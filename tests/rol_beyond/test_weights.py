@@ -23,10 +23,7 @@ FORMER_WORDS = {"entropy": "bce"}  # in the header of a file that was written be
 @pytest.mark.parametrize("path", WEIGHTS, ids=lambda path: path.stem)
 def test_weights_are_small_and_have_a_card_that_fits(path: Path) -> None:
     assert path.stat().st_size < 25e6
-    card, network = (
-        json.loads(path.with_suffix(".json").read_text(encoding="utf-8")),
-        load_network(path),
-    )
+    card, network = (json.loads(path.with_suffix(".json").read_text(encoding="utf-8")), load_network(path))
     assert (
         network.about["card"] == f"{card.get('former_name', card['name'])}.json" and card["name"] == path.stem
     )

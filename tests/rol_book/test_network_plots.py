@@ -20,13 +20,7 @@ pytestmark = pytest.mark.torch
 def test_layers_of_the_generator():
     network = build_generator(4, 3, rng=torch.Generator().manual_seed(1))
     layers = trace_layers(network, 1, 64)
-    assert [layer.kind for layer in layers] == [
-        "input",
-        *["conv"] * 3,
-        "residual",
-        *["conv up"] * 2,
-        "conv",
-    ]
+    assert [layer.kind for layer in layers] == ["input", *["conv"] * 3, "residual", *["conv up"] * 2, "conv"]
     assert [layer.channels for layer in layers] == [1, 4, 8, 16, 16, 8, 4, 1]
     assert [layer.height for layer in layers] == [64, 64, 32, 16, 16, 32, 64, 64]
     assert layers[4].repeats == 3 and layers[1].label == "conv\n7 x 7"

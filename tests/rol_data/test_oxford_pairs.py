@@ -7,13 +7,7 @@ import numpy as np
 import pytest
 
 from rol import oxford
-from rol_data.oxford_pairs import (
-    RealPairs,
-    find_pairs,
-    firing_fractions,
-    load_sweep_points,
-    sweep_start,
-)
+from rol_data.oxford_pairs import RealPairs, find_pairs, firing_fractions, load_sweep_points, sweep_start
 from rol_sim.session import oxford_files
 
 START = 1_547_131_046_000_000

@@ -42,18 +42,8 @@ NEEDED = {
     "Surface": {"diffuse": 0.1},
     "SessionSettings": {"start": "2019-01-10T11:46:21"},
 }
-NAMES = (
-    "Settings",
-    "Config",
-    "Rule",
-    "Model",
-    "FrontEnd",
-    "Surface",
-    "Noise",
-    "Measurement",
-    "Resampling",
-    "Field",
-)
+NAMES = ("Settings", "Config", "Rule", "Model", "FrontEnd", "Surface", "Noise", "Measurement", "Resampling")
+NAMES += ("Field",)
 PACKAGES = (rol, rol_beyond, rol_sim, rol_study)
 
 
@@ -148,7 +138,6 @@ def test_the_classes_are_all_there() -> None:
         (Measurement, {"d_th_m": 0.0}, MclError, r"d_th_m: 0.0 is not in \(0, inf\)"),
         (MotionNoise, {"yaw_rad": -0.1}, MclError, r"yaw_rad: -0.1 is not in \[0, inf\)"),
         (Resampling, {"ess_fraction": 1.01}, MclError, r"ess_fraction: 1.01 is not in \[0, 1\]"),
-        (Measurement, {"cell_m": 0}, MclError, "cell_m: 0 is not"),
         (MclSettings, {"n_particles": 0}, MclError, r"n_particles: 0 is not a whole number in \[1, inf\)"),
         (MclSettings, {"n_particles": 3.5}, MclError, "n_particles: 3.5 is not a whole number"),
         (Measurement, {"exponent": "20"}, MclError, "exponent: '20' is not in"),
@@ -163,18 +152,15 @@ def test_the_classes_are_all_there() -> None:
         (ScanToMapSettings, {"range_m": 0.0}, OdometryError, r"range_m: 0.0 is not in \(0, inf\]"),
         (DetectionSettings, {"lost_below": 1.5}, ValueError, "lost_below: 1.5 is not in"),
         (RecoverySettings, {"reference_contrast": 0.0}, ValueError, "reference_contrast: 0.0 is not in"),
-        (RecoverySettings, {"stationary_weight": 0.0}, ValueError, "stationary_weight: 0.0 is not in"),
         (
             MotionModel,
             {"sigma_base": (0.1, -0.1, 0.0)},
             ValueError,
             r"sigma_base: \(0.1, -0.1, 0.0\) is not in",
         ),
-        (MotionModel, {"outlier_fraction": 2.0}, ValueError, "outlier_fraction: 2.0 is not in"),
         (MapSettings, {"cell_m": -1.0}, ValueError, "cell_m: -1.0 is not in"),
         (FailureRule, {"seconds": -1.0}, EvaluationError, "seconds: -1.0 is not in"),
         (TrainConfig, {"batch_size": 0}, Pix2PixError, "batch_size: 0 is not a whole number in"),
-        (TrainConfig, {"beta1": 1.0}, Pix2PixError, "beta1: 1.0 is not in"),
         (PairSettings, {"pixel_size": 0.0}, ValueError, r"pixel_size: 0.0 is not in \(0, inf\)"),
         (FrontEnd, {"fraction_1m": 40.0}, SampledPointsError, "fraction_1m: 40.0 is not in"),
         (RadarSettings, {"layer_widths_deg": (0.8, 0.0)}, ValueError, "layer_widths_deg: .* is not in"),

@@ -74,9 +74,7 @@ def test_settings_are_read(recipe: Path) -> None:
         ({"seed": -1}, "seed: -1 is not a whole number in"),
         ({"seed": 1.5}, "seed: expected int, got 1.5"),
         ({"loop_m": "long"}, "loop_m: expected float, got 'long'"),
-        ({"loop_m": float("nan")}, "loop_m: nan is not in"),
         ({"loop_m": 100}, "loop_m: 100.0 is not in \\[450, inf\\)"),
-        ({"radar_height_m": 0}, "radar_height_m: 0.0 is not in"),
         ({"sweeps": "some"}, "sweeps: 'some' is none of nearest, all, none"),
         ({"labels_every": True}, "labels_every: expected int, got True"),
         ({"lidar": 3}, "lidar: expected dict, got 3"),
@@ -88,12 +86,6 @@ def test_settings_are_read(recipe: Path) -> None:
         ({"sessions": {"sim-a": {}}}, "session sim-a: the key 'start' is missing"),
         ({"sessions": {"sim-a": {"start": "noon"}}}, "start: 'noon' is not a date and time"),
         ({"sessions": {"sim-a": {"start": START, "scan": 4}}}, "unknown key 'scan'"),
-        ({"sessions": {"sim-a": {"start": START, "scans": -4}}}, "scans: -4 is not a whole number in"),
-        (
-            {"sessions": {"sim-a": {"start": START, "vehicles": -1}}},
-            "vehicles: -1 is not a whole number in",
-        ),
-        ({"sessions": {"sim-a": {"start": START, "cruise_mps": 0}}}, "cruise_mps: 0.0 is not in"),
         (
             {"sessions": {"sim-a": {"start": START, "parked_share": 1.2}}},
             "parked_share: 1.2 is not in \\[0, 1\\]",

@@ -126,17 +126,3 @@ def test_other_faults_are_named(small_root: Path, tmp_path: Path) -> None:
         build_segment(tmp_path, "02", 0, 3, 3)
     with pytest.raises(ValueError, match="unknown key 'clouds'"):
         build_segment(small_root, "02", 0, 3, 3, clouds=1)
-
-
-@pytest.mark.torch
-@pytest.mark.slow  # most of it reads the map
-def test_an_untrained_network_on_the_real_route(real_root: Path) -> None:
-    torch = pytest.importorskip("torch")
-    from rol.pix2pix import build_generator
-
-    generator = build_generator(2, 1, rng=torch.Generator().manual_seed(1))
-    generator.image_size = (512, 512)
-    network = TrainedNetwork(generator, {"threshold": 1}, {}, {})
-    clouds = list(render_points(build_segment(real_root, "02", 6000, 3, 3), network))
-    assert len(clouds) == 3 and all(len(cloud) > 100 for cloud in clouds)
-    assert max(np.abs(cloud).max() for cloud in clouds) < 64.0 * np.sqrt(2.0)

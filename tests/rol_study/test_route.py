@@ -216,8 +216,9 @@ def test_the_published_motion_is_that_of_session_01(real_root: Path) -> None:
 
 
 def test_the_published_contrast_is_that_of_session_01(real_root: Path) -> None:
+    experiment = prepare_experiment(real_root, "02", FrontEnd(), max_scans=3)
     for front_end in (FrontEnd(), FrontEnd(0.50, 0.70), FrontEnd(0.65, 0.80), FrontEnd(0.80, 0.90)):
-        taught = prepare_experiment(real_root, "02", front_end, max_scans=3)
+        taught = change_front_end(experiment, front_end)
         assert taught.calibration_session == "01"
         assert published_reference_contrast(front_end.fraction_1m) == pytest.approx(
             taught.reference_contrast, abs=0.003
@@ -228,11 +229,7 @@ def test_the_published_contrast_is_that_of_session_01(real_root: Path) -> None:
 
 
 def test_a_session_alone_is_not_calibrated_on_itself(real_root: Path, tmp_path: Path) -> None:
-    for name in (
-        rall.MAP_PATH,
-        f"{rall.POSES_PATH}/pose_xy_02.txt",
-        f"{rall.ODOMETRY_PATH}/seq02_odom.txt",
-    ):
+    for name in (rall.MAP_PATH, f"{rall.POSES_PATH}/pose_xy_02.txt", f"{rall.ODOMETRY_PATH}/seq02_odom.txt"):
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).symlink_to(real_root / name)
     experiment = prepare_experiment(tmp_path, "02", FrontEnd(), max_scans=3)

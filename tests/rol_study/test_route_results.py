@@ -71,10 +71,7 @@ def test_odometries_are_compared_on_the_same_runs() -> None:
         fraction_1m=[0.4] * 3, odometry=["rall", "rall", "true"], seed=[1, 2, 2], rmse_m=[9.0, 3.0, 1.0]
     )
     groups = results.odometry_table(runs)
-    assert groups.rmse_m.to_dict() == {
-        (0.4, "02", "rall", "paper"): 3.0,
-        (0.4, "02", "true", "paper"): 1.0,
-    }
+    assert groups.rmse_m.to_dict() == {(0.4, "02", "rall", "paper"): 3.0, (0.4, "02", "true", "paper"): 1.0}
 
 
 def make_session(number: str, left_m: float) -> RouteSession:

@@ -37,17 +37,8 @@ def summary_line(run: Run, more: str = "", plan: str = "no update", status: str 
     """Line of Snakemake's summary for the executed notebook of a run, or another output of it."""
     source, output = f"notebooks/{run.chapter}.ipynb", run.path(CONFIG["out_dir"]).as_posix()
     command = f"env A=1 /some/where/bin/python -m papermill {source} {output} > log"
-    words = [
-        more or output,
-        "today",
-        run.chapter,
-        f"{output}.log",
-        f"{SESSION},{source}",
-        command,
-        status,
-        plan,
-    ]
-    return "\t".join(words) + "\n"
+    words = [more or output, "today", run.chapter, f"{output}.log", f"{SESSION},{source}", command]
+    return "\t".join([*words, status, plan]) + "\n"
 
 
 @pytest.fixture
@@ -67,12 +58,13 @@ def project(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     times = {"papermill": {"start_time": "2026-11-25T10:00:00", "end_time": "2026-11-25T10:01:00"}}
     for run in chapters.all_runs(CONFIG):
         write(tmp_path / run.path(CONFIG["out_dir"]), json.dumps(new_notebook(metadata=times)))
-    for name in (
+    results = (
         "alignment/train/a.csv",
         "alignment/train/b.json",
         "alignment/seq01/a.csv",
         "results/table.csv",
-    ):
+    )
+    for name in results:
         write(tmp_path / "build/tiny" / name, "1")
     for name in ("pix2pix/generator.safetensors", "pairs/train/1.png", "logs/x.json", "book/x.json"):
         write(tmp_path / "build/tiny" / name, "not part of it")
@@ -111,7 +103,7 @@ def test_archive_holds_code_notebooks_book_and_results(project: Path) -> None:
     with zipfile.ZipFile(path) as opened:
         names = set(opened.namelist())
         assert names == {
-            *(
+            *[
                 "CITATION.cff",
                 "codemeta.json",
                 "README.md",
@@ -119,7 +111,7 @@ def test_archive_holds_code_notebooks_book_and_results(project: Path) -> None:
                 ".gitignore",
                 "Snakefile",
                 "tool.sh",
-            ),
+            ],
             *("notebooks/02_alignment.ipynb", "notebooks/08_results.ipynb"),
             *("index.html", "ro-crate-metadata.json", "build/tiny/book/_build/html/index.html"),
             *(f"build/tiny/notebooks/02_alignment/{name}.ipynb" for name in ("train", "seq01")),
@@ -172,11 +164,7 @@ def test_same_commit_and_build_give_the_same_archive(project: Path) -> None:
     ("status", "plan", "words"),
     [
         ("missing", "update pending", "missing"),
-        (
-            "missing",
-            "no update",
-            "missing",
-        ),  # Snakemake does not make a file again that no later job asks for
+        ("missing", "no update", "missing"),  # Snakemake does not make a file again that no later job needs
         ("params changed", "update pending", "out of date"),
     ],
 )

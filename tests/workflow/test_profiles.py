@@ -93,21 +93,9 @@ def test_profile_plans_all_jobs(name: str, tmp_path: Path) -> None:
     own = {key: value for key, value in profile.items() if not key.startswith(f"{executor}-")}
     (tmp_path / "profile").mkdir()
     (tmp_path / "profile" / "config.yaml").write_text(yaml.safe_dump(own), encoding="utf-8")
-    words = [
-        "--snakefile",
-        str(ROOT / "Snakefile"),
-        "--profile",
-        "profile",
-        "--configfile",
-        "config/smoke.yaml",
-    ]
-    answer = subprocess.run(
-        [sys.executable, "-m", "snakemake", "-n", *words],
-        capture_output=True,
-        text=True,
-        check=False,
-        cwd=tmp_path,
-    )
+    words = ["--snakefile", ROOT / "Snakefile", "--profile", "profile", "--configfile", "config/smoke.yaml"]
+    command = [sys.executable, "-m", "snakemake", "-n", *words]
+    answer = subprocess.run(command, capture_output=True, text=True, check=False, cwd=tmp_path)
     assert answer.returncode == 0, answer.stderr
     plan = answer.stdout + answer.stderr
     runs = len(chapters.all_runs(chapters.load_config(ROOT / "config/smoke.yaml")))

@@ -1,6 +1,7 @@
 """Set-up: the lock for every Python, what the pages name, and set_up.sh with interpreters that only pretend."""
 
 import fcntl
+import functools
 import importlib.metadata
 import itertools
 import json
@@ -62,16 +63,20 @@ def test_lock_covers_what_the_project_asks_for(python: str, platform: dict[str, 
             assert versions[canonicalize_name(wanted.name)] in wanted.specifier, wanted
 
 
+@functools.cache
+def asked_for_by(name: str, version: str) -> list[Requirement]:
+    """Read what a package asks for; nothing if it is not installed in this version, as for another Python."""
+    found = list(importlib.metadata.distributions(name=name))[:1]
+    is_there = found and found[0].version.partition("+")[0] == version
+    return [Requirement(line) for line in found[0].requires or []] if is_there else []
+
+
 @pytest.mark.parametrize("python", PYTHONS)
 def test_lock_covers_what_the_packages_ask_for(python: str) -> None:
     where = environment(python, LINUX)
     versions = pins(where)
     for name, version in versions.items():
-        found = list(importlib.metadata.distributions(name=name))
-        if not found or found[0].version.partition("+")[0] != version:
-            continue  # belongs to another Python
-        wanted = [Requirement(line) for line in found[0].requires or []]
-        for part in wanted:
+        for part in asked_for_by(name, version):
             if part.marker is None or part.marker.evaluate({**where, "extra": ""}):
                 brought_by_torch = re.match(r"cuda|nvidia|triton", part.name)
                 assert brought_by_torch or canonicalize_name(part.name) in versions, (

@@ -138,8 +138,9 @@ def test_binder_finds_what_the_button_needs() -> None:
 
 def test_metadata_files_of_macos_are_passed_over(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     package, pages = tmp_path / "src/rol", tmp_path / "book"
-    shutil.copytree(ROOT / "src", tmp_path / "src", ignore=shutil.ignore_patterns("__pycache__"))
+    shutil.copytree(ROOT / "src/rol", package, ignore=shutil.ignore_patterns("__pycache__"))
     shutil.copytree(ROOT / "book", pages, ignore=shutil.ignore_patterns("__pycache__"))
+    (pages / "api.yml").write_text("Map: {rol.maps: [load_map]}\n", encoding="utf-8")
     for folder, kind in itertools.product((package, pages, pages / "images"), ("md", "py")):
         (folder / f"._x.{kind}").write_bytes(b"\0\5\x16\7\xff")
     monkeypatch.chdir(tmp_path)

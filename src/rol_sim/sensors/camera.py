@@ -24,6 +24,8 @@ PAINT = {
     "TREE_TRUNK": (0.40, 0.30, 0.22),
     "PERSON": (0.80, 0.35, 0.25),
 }
+PLAN_HEIGHT_M = 60.0  # where the rays of a plan start
+VIEW_SHAPE, VIEW_RAD = (300, 720), np.deg2rad(80.0)  # rows and columns of a view, and its horizontal angle
 LIGHT = np.array([-0.35, 0.45, 0.82])  # unit vector to the sun
 
 
@@ -35,9 +37,7 @@ def _paint_table() -> np.ndarray:
     return table
 
 
-def plan_rays(
-    centre: np.ndarray, half_m: float, pixel_m: float, height: float = 60.0
-) -> tuple[np.ndarray, tuple[int, int]]:
+def plan_rays(centre: np.ndarray, half_m: float, pixel_m: float) -> tuple[np.ndarray, tuple[int, int]]:
     """Aim rays straight down on a grid of places.
 
     Parameters
@@ -46,8 +46,6 @@ def plan_rays(
         Middle of the plan [m].
     half_m, pixel_m : float
         Half the edge of the plan and the edge of a pixel [m].
-    height : float
-        Where the rays start [m].
 
     Returns
     -------
@@ -59,13 +57,11 @@ def plan_rays(
     offsets = np.arange(-half_m + 0.5 * pixel_m, half_m, pixel_m)
     x, y = np.meshgrid(centre[0] + offsets, centre[1] - offsets)
     rays = np.zeros((x.size, 6), dtype=np.float32)
-    rays[:, 0], rays[:, 1], rays[:, 2], rays[:, 5] = x.ravel(), y.ravel(), height, -1.0
+    rays[:, 0], rays[:, 1], rays[:, 2], rays[:, 5] = x.ravel(), y.ravel(), PLAN_HEIGHT_M, -1.0
     return rays, x.shape
 
 
-def view_rays(
-    pose: np.ndarray, height: float, *, width: int = 720, rows: int = 300, opening: float = np.deg2rad(80.0)
-) -> tuple[np.ndarray, tuple[int, int]]:
+def view_rays(pose: np.ndarray, height: float) -> tuple[np.ndarray, tuple[int, int]]:
     """Aim the rays of a pinhole camera that looks level along a pose.
 
     Parameters
@@ -74,10 +70,6 @@ def view_rays(
         Place and direction of view (x, y, yaw) [m, m, rad].
     height : float
         Height of the camera [m].
-    width, rows : int
-        Size of the picture.
-    opening : float
-        Horizontal angle of view [rad].
 
     Returns
     -------
@@ -86,7 +78,8 @@ def view_rays(
     shape : tuple of int
         (rows, width).
     """
-    focal = 0.5 * width / np.tan(0.5 * opening)
+    rows, width = VIEW_SHAPE
+    focal = 0.5 * width / np.tan(0.5 * VIEW_RAD)
     left, up = np.meshgrid(
         (0.5 * width - 0.5 - np.arange(width)) / focal, (0.45 * rows - np.arange(rows)) / focal
     )

@@ -1,5 +1,4 @@
-"""Simulate sweeps of an HDL-32E, one turn of 32 lasers while the car moves,
-in the units of Oxford's raw files.
+"""Simulate sweeps of an HDL-32E on a moving vehicle, in the units of Oxford's raw files.
 
 Radar frame: x forward, y left, z up, level, above the ground by the mast's height. The lidar's place in it
 is its extrinsic calibration. Angles run clockwise seen from above, 0 to the lidar's left, elevations

@@ -1,5 +1,4 @@
-"""Convert point echoes to the bytes of a CTS350-X scan: point spread, speckle, noise, streaks, leakage,
-codes.
+"""Convert point echoes to the bytes of a CTS350-X scan: point spread, speckle, noise, leakage, codes.
 
 All constants here were measured on real scans. Columns are range bins, rows azimuths in the order of the
 turn. The field is complex: echoes add with their phases, so speckle and its correlation come out by
@@ -326,8 +325,7 @@ def _interpolate_peak(field, row, peak, amplitude):  # pragma: no cover (compile
 
 @compiled
 def _harmonic_amplitude(order, amplitude, gain, half_angle):  # pragma: no cover (compiled)
-    """Amplitude of a harmonic: square law for the second,
-    Fourier series of a clipped sine for the odd ones."""
+    """Compute a harmonic's amplitude: square law for the second, a clipped sine's for the odd ones."""
     if order == 2:
         return SECOND_HARMONIC * (gain * amplitude) ** 2
     below = np.sin((order - 1) * half_angle) / (order - 1)

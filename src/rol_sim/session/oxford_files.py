@@ -70,8 +70,7 @@ def save_radar(path: Path | str, scan: RadarScan) -> None:
 
 
 def save_velodyne_raw(path: Path | str, raw: VelodyneRaw) -> None:
-    """Write one raw sweep as `rol.oxford.load_velodyne_raw` returns it, bit for bit;
-    an OxfordError if not."""
+    """Write a raw sweep as `rol.oxford.load_velodyne_raw` reads it, bit for bit; an OxfordError if not."""
     n = np.size(raw.stamps_us)
     if n == 0:
         raise OxfordError(f"{path}: sweep without a firing")
@@ -86,8 +85,7 @@ def save_velodyne_raw(path: Path | str, raw: VelodyneRaw) -> None:
 
 
 def save_velodyne_binary(path: Path | str, points: np.ndarray) -> None:
-    """Write points (n, 4), float32, for `rol.oxford.load_velodyne_binary`;
-    an OxfordError if it refuses them."""
+    """Write points (n, 4), float32, as `rol.oxford.load_velodyne_binary` reads them, or raise its error."""
     points = np.asarray(points, dtype="<f4")
     if points.ndim != 2 or points.shape[1] != 4 or len(points) == 0:
         raise OxfordError(f"{path}: expected points of shape (n, 4) with n > 0, got {points.shape}")

@@ -116,15 +116,13 @@ def classify_cells(points: np.ndarray) -> Cells:
 
 
 def crop_cells(cells: Cells, places: np.ndarray, radius: float, *, clear_m: float = 0.0) -> Cells:
-    """Keep the cells within a radius of any of some places, shape (m, 2),
-    and not nearer than `clear_m` [m]."""
+    """Keep the cells within a radius of any place, shape (m, 2), and not nearer than `clear_m` [m]."""
     gaps = cKDTree(places).query(cells.points, distance_upper_bound=radius)[0]
     return cells.take(np.flatnonzero(np.isfinite(gaps) & (gaps >= clear_m)))
 
 
 def _sort_into_cells(points: np.ndarray, side: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Sort points into square cells: their order, each one's cell, and where each cell begins,
-    by row and column."""
+    """Sort points into square cells: their order, each one's cell, and the start of each cell."""
     shape = check_grid(np.floor(np.ptp(points, axis=0) / side) + 1, points, "map", n_bytes=32)
     cell_of = np.floor((points - points.min(axis=0)) / side).astype(np.int64)
     flat = cell_of[:, 0] * shape[1] + cell_of[:, 1]
@@ -135,8 +133,7 @@ def _sort_into_cells(points: np.ndarray, side: float) -> tuple[np.ndarray, np.nd
 
 @compiled
 def _count_strips(points, order, cell_of, starts, reach, half, n_ways):  # pragma: no cover (compiled)
-    """Count, for each point and each of n directions over half a turn,
-    the neighbours in a strip through it."""
+    """Count the neighbours in a strip through each point, for n directions over half a turn."""
     counts = np.ones((len(points), n_ways), dtype=np.int16)
     n_near = np.zeros(len(points), dtype=np.int64)
     for i in range(len(points)):
