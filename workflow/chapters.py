@@ -96,10 +96,8 @@ def check_config(config: dict, name: str) -> dict:
         raise ChapterError(f"{name}: missing keys {sorted(missing)}, unknown keys {sorted(unknown)}")
     for key in LISTS:
         words = config[key]
-        if not isinstance(words, list) or not all(word and isinstance(word, str) for word in words):
-            raise ChapterError(f"{name}: `{key}` is no list of names")
-    if not config["methods"]:
-        raise ChapterError(f"{name}: `methods` is empty")
+        if not words or not isinstance(words, list) or not all(w and isinstance(w, str) for w in words):
+            raise ChapterError(f"{name}: `{key}` is no list of names, or empty")
     for key in FOLDERS:
         if not isinstance(config[key], str) or Path(config[key]) == Path("."):
             raise ChapterError(f"{name}: `{key}` names no folder of its own: {config[key]!r}")
@@ -211,8 +209,8 @@ def translation(config: dict, notebooks: Path = NOTEBOOKS) -> dict[str, str]:
         ``weights``: file of the network; ``options``: arguments, quoted for the shell.
     """
     chapter = "05_real_vs_fake"
-    defaults = notebook_parameters(notebooks / f"{chapter}.ipynb")
-    known = defaults | run_parameters(config, Run(chapter), notebooks)
+    path = notebooks / f"{chapter}.ipynb"
+    known = notebook_parameters(path) | run_parameters(config, Run(chapter), notebooks)
     weights = Path(known["weights_root"], f"{known['network']}.safetensors")
     if known["network"] == "chapter 4":
         weights = Path(config["out_dir"], "pix2pix", "generator.safetensors")

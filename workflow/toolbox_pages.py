@@ -33,8 +33,7 @@ def page_text(title: str, above: str, lines: list[str]) -> str:
 
 def table_of(docstrings: dict[str, str | None]) -> list[str]:
     """Write a table of targets of Sphinx's role `py:obj`, each with the first sentence of its docstring."""
-    options = "   :class: names\n   :header-rows: 1"
-    lines = [".. list-table::", options, "", "   * - name", "     - description"]
+    lines = [".. list-table::\n   :class: names\n   :header-rows: 1", "", "   * - name", "     - description"]
     for name, docstring in docstrings.items():
         paragraph = " ".join((docstring or "").split("\n\n")[0].split())
         lines += [f"   * - :py:obj:`{name}`", f"     - {re.split('(?<=[.?!]) (?=[A-Z])', paragraph)[0]}"]

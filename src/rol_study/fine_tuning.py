@@ -122,7 +122,7 @@ def evaluate_scans(
         The network.
     pairs : mapping of str to sequence of RealPair
         Scans with lidar or map points, by source. Those of "fog" are compared up to `FOG_RANGE_M`, with the
-        settings `rol_study.real_scans.FOG`.
+        settings ``rol_study.real_scans.FOG``.
     thresholds : sequence of int
         Grey values from which on a pixel is a point.
     bf16 : bool

@@ -28,8 +28,7 @@ FIRST_PARTICLES, MAX_PARTICLES = 40_000, 5000  # at the first scan, and later
 EVEN_M = 2.0  # radius within which points share their weight [m]
 SIGMAS = (0.1, 0.05, float(np.deg2rad(0.3)))  # of an odometry increment [m, m, rad]
 LIMITS = (0.6, 0.6)  # aimed at [m, deg]
-# Takes a scan and a twist (vx, vy, yaw rate) or None; returns points, compensated for the twist, (n, 2) [m].
-FrontEnd = Callable[[Any, tuple[float, float, float] | None], np.ndarray]
+FrontEnd = Callable[[Any], np.ndarray]  # takes a scan and returns its points as recorded, shape (n, 2) [m]
 FROM_SCAN = 4  # scan, counted from 1, from which on runs are judged
 
 
@@ -94,15 +93,14 @@ def wrong_starts(off_m: float, off_deg: float, n_directions: int) -> np.ndarray:
     return np.array([(off_m * np.cos(a), off_m * np.sin(a), s * turn) for a in angles for s in (1, -1)])
 
 
-def cache_front_end(make_points: FrontEnd) -> FrontEnd:
-    """Cache the points of a scan and a twist for all starts."""
-    known: dict[Any, np.ndarray] = {}
+def cache_front_end(front_end: FrontEnd) -> FrontEnd:
+    """Cache the points of each scan for all starts."""
+    known: dict[int, np.ndarray] = {}
 
-    def points_of(scan: Any, twist: tuple[float, float, float] | None) -> np.ndarray:
-        key = scan.stamp_us, twist
-        if key not in known:
-            known[key] = make_points(scan, twist)
-        return known[key]
+    def points_of(scan: Any) -> np.ndarray:
+        if scan.stamp_us not in known:
+            known[scan.stamp_us] = front_end(scan)
+        return known[scan.stamp_us]
 
     return points_of
 
@@ -130,7 +128,7 @@ def localize_from_starts(
     scans : sequence of RealScan
         The scans, in the order of time.
     front_end : callable
-        Takes a scan and a twist or None and returns points, see `cache_front_end`.
+        Takes a scan and returns its points, see `cache_front_end`.
     map_points : array, shape (m, 2)
         Points of the map [m].
     starts : array, shape (s, 3)
@@ -147,7 +145,7 @@ def localize_from_starts(
     """
     grid = settings.filter.measurement.build_grid(map_points)
     odometry = LocalMapOdometry()  # it does not depend on the start
-    motions = {scan.stamp_us: odometry.step(front_end(scan, None), scan.stamp_us) for scan in scans}
+    motions = {scan.stamp_us: odometry.step(front_end(scan), scan.stamp_us) for scan in scans}
     shared = SimpleNamespace(step=lambda points, stamp_us: motions[stamp_us], deskew=odometry.deskew)
     runs = []
     for start in starts:
@@ -156,12 +154,8 @@ def localize_from_starts(
             recovering = RecoveringFilter(
                 map_points, start, settings.filter, settings.recovery, rng, grid=grid
             )
-            localizer = RobustLocalizer(
-                recovering,
-                lambda scan: front_end(scan, None),
-                density_radius_m=settings.density_radius_m,
-                odometry=shared,
-            )
+            how = {"density_radius_m": settings.density_radius_m, "odometry": shared}
+            localizer = RobustLocalizer(recovering, front_end, **how)
             runs.append([localizer.step(scan).pose for scan in scans])
     return np.array(runs)
 
@@ -295,7 +289,7 @@ def localize_alone(
 ) -> np.ndarray:
     """Localize each scan of drives on its own, as recorded; errors, shape (n, s, 2) [m, deg]."""
     return np.array([
-        localize_points(front_end(scan, None), scan.pose, drive.map_points, offsets, settings, seed)
+        localize_points(front_end(scan), scan.pose, drive.map_points, offsets, settings, seed)
         for drive in drives
         for scan in drive.scans
     ]).reshape(-1, len(offsets), 2)  # fmt: skip
@@ -461,7 +455,7 @@ def localize_points(
 
 def evaluate_turn(
     scan: RealScan,
-    front_ends: Mapping[str, FrontEnd],
+    front_ends: Mapping[str, Callable[..., np.ndarray]],
     variants: Mapping[str, tuple[bool, float]],
     map_points: np.ndarray,
     localize: Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray],
@@ -473,7 +467,8 @@ def evaluate_turn(
     scan : RealScan
         Scan with pose and twist.
     front_ends : mapping of str to callable
-        Front ends by name, see `cache_front_end`.
+        By name; take a scan and a twist (vx, vy, yaw rate) or None [m/s, m/s, rad/s], and return points
+        compensated for it, shape (n, 2) [m].
     variants : mapping of str to (bool, float)
         Name -> whether motion is compensated, and the angle added to the azimuths [rad].
     map_points : array, shape (m, 2)

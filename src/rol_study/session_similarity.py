@@ -80,7 +80,7 @@ class GeneratedSession(PairedSession):
         return image_to_points(self.image(us), **{**self.points, **points})
 
     def detected(self, us: int) -> dict[str, np.ndarray]:
-        """Detect points in the polar scan by each of `rol_beyond.front_ends.DETECTORS`, shape (n, 2) [m]."""
+        """Detect points in the scan by each of ``rol_beyond.front_ends.DETECTORS``, shape (n, 2) [m]."""
         scan = load_radar(open_session(Path(self.sessions_root, self.name)).radar_path(us))
         return {name: detect_points(scan.power, scan.azimuths, detector=name) for name in DETECTORS}
 

@@ -43,14 +43,13 @@ def test_runs_are_judged_from_a_scan_on() -> None:
     assert np.isnan(short["worst"]).all() and np.isnan(short["met"])
 
 
-def test_points_of_a_scan_and_a_twist_are_made_once() -> None:
+def test_points_of_a_scan_are_made_once() -> None:
     calls = []
-    points_of = real_localization.cache_front_end(lambda scan, twist: calls.append(twist) or WALL)
+    points_of = real_localization.cache_front_end(lambda scan: calls.append(scan.stamp_us) or WALL)
     for _ in range(3):
         for scan in (make_scan(1), make_scan(2)):
-            points_of(scan, None)
-            points_of(scan, (1.0, 0.0, 0.0))
-    assert len(calls) == 4
+            points_of(scan)
+    assert len(calls) == 2
 
 
 def make_settings() -> real_localization.LocalizerSettings:
@@ -98,7 +97,7 @@ def test_drives_are_localized_and_their_errors_named() -> None:
     np.testing.assert_allclose(drives[0].seconds(), [0.0, 0.25, 0.5, 0.75])
     starts = real_localization.wrong_starts(0.5, 1.0, 2)
     runs = real_localization.localize_drives(
-        drives, {"raw": lambda scan, twist: ROOM}, starts, make_settings(), [1, 2]
+        drives, {"raw": lambda scan: ROOM}, starts, make_settings(), [1, 2]
     )
     assert [poses.shape for poses in runs["raw"].poses] == [(8, 4, 3), (8, 1, 3)]
     assert set(runs["raw"].first_run()) == {scan.stamp_us for scan in scans}
@@ -107,7 +106,7 @@ def test_drives_are_localized_and_their_errors_named() -> None:
     table = real_localization.tabulate_runs({"room": runs, "none": {}}, {"raw": "k-strongest"})
     assert table[["map", "points"]].values.tolist() == [["room", "k-strongest"]]
     assert table["worst [m]"][0] == numbers["raw_worst_m"]
-    alone = real_localization.localize_alone(drives, lambda scan, twist: ROOM, starts, make_settings(), 1)
+    alone = real_localization.localize_alone(drives, lambda scan: ROOM, starts, make_settings(), 1)
     assert alone.shape == (5, 4, 2) and real_localization.describe_alone(alone)["lone_m"] < 0.6
     assert np.isnan(list(real_localization.describe_alone(alone[:0]).values())).all()
     assert real_localization.split_drives([], ROOM[:0], None) == []

@@ -267,7 +267,7 @@ def test_binder_makes_a_session_of_the_demo() -> None:
     [
         ("profile: smoke", "profile: [", "not YAML"),
         ("methods: [paper, robust]", "methods: paper", "`methods` is no list of names"),
-        ("methods: [paper, robust]", "methods: []", "`methods` is empty"),
+        ("methods: [paper, robust]", "methods: []", "`methods` is no list of names, or empty"),
         ("book_dir: build/smoke/book", "book_dir: .", "`book_dir` names no folder of its own: '.'"),
         ("out_dir: build/smoke", 'out_dir: ""', "`out_dir` names no folder of its own: ''"),
     ],
