@@ -69,7 +69,8 @@ def find_gaps(image: np.ndarray, n_panels: int) -> list[int] | None:
         if len(near) == 0:
             return None
         runs = np.split(near, np.flatnonzero(np.diff(near) > 1) + 1)
-        cuts.append(int(np.median(max(runs, key=len))))
+        long = max(map(len, runs)) / 2.0  # the first gap, left of the next panel's label
+        cuts.append(int(np.median(next(run for run in runs if len(run) >= long))))
     return cuts
 
 

@@ -14,7 +14,7 @@ SPEED_COLOURS = {"plain": plots.COLOURS["map"], "ours": plots.COLOURS["real"]}
 
 
 def draw_speedup(ax: Axes, table: pd.DataFrame, *, period_ms: float) -> Axes:
-    """Draw the time of each step, plain and optimised, as two dots on a line.
+    """Draw the time of each step, plain and optimized, as two dots on a line.
 
     Parameters
     ----------
@@ -32,7 +32,7 @@ def draw_speedup(ax: Axes, table: pd.DataFrame, *, period_ms: float) -> Axes:
     """
     places = np.arange(len(table))[::-1]
     ax.hlines(places, table["ours [ms]"], table["plain [ms]"], color="#BBBBBB", zorder=1)
-    for name, label in (("plain", "plain"), ("ours", "optimised")):
+    for name, label in (("plain", "plain"), ("ours", "optimized")):
         ax.plot(table[f"{name} [ms]"], places, "o", color=SPEED_COLOURS[name], label=label)
     ax.axvline(period_ms, color="#444444", linestyle="--", linewidth=1.0, label="between two scans")
     ax.set_yticks(places, table.index)

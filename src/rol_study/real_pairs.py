@@ -526,12 +526,12 @@ def tabulate_kinds(
 
 
 def describe_kinds(table: pd.DataFrame, network: str) -> dict[str, float]:
-    """Name percentages of `tabulate_kinds` for a text; NaN with an empty table.
+    """Name percentages of `tabulate_kinds` for a text; NaN for a network that is not in the table.
 
     ``on_road`` (within 4 m of the path), ``wrong`` (more than 2 m off), of these ``in_view``, ``hidden`` and
     ``wrong_on_road``, all of a network's points; ``road_of_wrong``, the wrong ones on the road of all wrong.
     """
-    if table.empty:
+    if network not in table.index:
         names = ("on_road", "wrong", "in_view", "hidden", "wrong_on_road", "road_of_wrong")
         return dict.fromkeys(names, np.nan)
     wrong, in_view, wrong_on_road = table.loc[network, OFF]
@@ -814,23 +814,27 @@ def describe_comparison(comparison: Comparison, front_ends: Iterable[str]) -> di
     Returns
     -------
     numbers : dict
-        ``<front end>_1m`` and ``<front end>_2m``: precision as in the paper, with "_" for "-"; ``chance_1m``,
-        the mean over all front ends; ``gain_sweeps`` and ``gain_motion``, the mean gain over the front ends
-        at 1 m by all sweeps of the turn, and by compensation alone. NaN without pairs.
+        ``<front end>_1m`` and ``<front end>_2m``, precision as in the paper, and ``<front end>_points`` per
+        scan, with "_" for "-"; ``lidar_points`` per sweep; ``chance_1m``, the mean over all front ends;
+        ``gain_sweeps`` and ``gain_motion``, the mean gain over the front ends at 1 m by all sweeps of the
+        turn, and by compensation alone. NaN without pairs.
     """
-    rows = comparison.rows.astype({"precision_1m": float, "precision_2m": float})
-    means = 100 * rows.groupby(["motion", "sweeps", "front_end"])[["precision_1m", "precision_2m"]].mean()
-    own, at_1m = means.reindex([(*AS_IN_PAPER, name) for name in front_ends]), means.precision_1m
+    names = {"precision_1m": "1m", "precision_2m": "2m", "n_points": "points", "n_lidar_points": "lidar"}
+    rows = comparison.rows.astype(dict.fromkeys(names, float))
+    means = rows.groupby(["motion", "sweeps", "front_end"])[list(names)].mean().rename(columns=names)
+    means[["1m", "2m"]] *= 100
+    own, at_1m = means.reindex([(*AS_IN_PAPER, name) for name in front_ends]), means["1m"]
     numbers = {
-        f"{name.replace('-', '_')}_{r}m": value
-        for (*_, name), row in own.iterrows()
-        for r, value in enumerate(row, start=1)
+        f"{name.replace('-', '_')}_{column}": own.loc[(*AS_IN_PAPER, name), column]
+        for *_, name in own.index
+        for column in ("1m", "2m", "points")
     }
     level = {
         way: at_1m[[key[:2] == way for key in at_1m.index]].mean() for way in product(MOTIONS, REFERENCES)
     }
     return {
         **numbers,
+        "lidar_points": own["lidar"].mean(),
         "chance_1m": 100 * comparison.chance_1m,
         "gain_sweeps": level["none", "turn"] - level[AS_IN_PAPER],
         "gain_motion": level["compensated", "nearest"] - level[AS_IN_PAPER],

@@ -208,6 +208,7 @@ def test_front_ends_are_compared_in_every_way(monkeypatch: pytest.MonkeyPatch) -
     numbers = real_pairs.describe_comparison(comparison, ["some", "other"])
     assert (numbers["some_1m"], numbers["some_2m"], numbers["gain_sweeps"]) == (0.0, 100.0, 0.0)
     assert numbers["gain_motion"] == 100.0 and np.isnan(numbers["other_1m"])
+    assert numbers["some_points"] > 0 and numbers["lidar_points"] > 0
     empty = real_pairs.compare_front_ends([], {})
     assert len(empty.average(real_pairs.BEST)) == 0
     assert np.isnan(list(real_pairs.describe_comparison(empty, ["some"]).values())).all()
