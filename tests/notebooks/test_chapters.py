@@ -25,6 +25,12 @@ def test_text_is_short(notebook: nbformat.NotebookNode) -> None:
     assert len("\n".join(text).split()) <= MOST_WORDS
 
 
+def test_no_line_of_text_is_taken_for_a_comment(notebook: nbformat.NotebookNode) -> None:
+    """MyST drops a line that begins with a percent sign, such as the rest of "10 % of the points"."""
+    text = [cell.source for cell in notebook.cells if cell.cell_type == "markdown"]
+    assert not re.search(r"^%", "\n".join(text), re.MULTILINE)
+
+
 def test_code_is_short(notebook: nbformat.NotebookNode) -> None:
     lines = [line for cell in own_code(notebook) for line in cell.source.splitlines() if line.strip()]
     assert len(lines) <= MOST_LINES
