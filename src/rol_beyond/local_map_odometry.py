@@ -495,7 +495,7 @@ class LocalMapOdometry:
         return log(relative_pose(self.accepted_pose, pose)) / self.blind_s
 
     def _window(self) -> tuple[float, float, float]:
-        """Give the search window, which grows with the time since the last accepted motion."""
+        """Return the search window, which grows with the time since the last accepted motion."""
         if not self.is_twist_known:
             return _FIRST_WINDOW
         x, y, yaw = _WINDOW

@@ -367,7 +367,7 @@ def run_robust(
     reference_contrast: float,
     report: Report = lambda line: None,
 ) -> FilterRun:
-    """Run the robust filter without resets; without ground truth it starts anywhere on the map.
+    """Run the robust filter without resets; without ground truth it begins with global localization.
 
     Parameters
     ----------
@@ -482,5 +482,5 @@ def fit_official(official: np.ndarray, run: FilterRun, first: int, fraction: flo
 
 
 def with_fitted_truth(session: RadarSession, run: FilterRun, first: int) -> RadarSession:
-    """Give a session whose ground truth is its official trajectory, fitted by `fit_official`."""
+    """Return a session whose ground truth is its official trajectory, fitted by `fit_official`."""
     return replace(session, truth=fit_official(session.official, run, first))

@@ -1,6 +1,6 @@
 """Find faulty segments of a ground truth by comparing its increments with those of the odometry.
 
-A few published ground truths stand still or leap while the vehicle drives on. No estimate can follow them, so
+A few published ground truths stop or jump while the vehicle moves on. No estimate can follow them, so
 results are given with and without these scans. The rule compares ground truth and odometry only; it sees no
 estimate.
 """
@@ -24,7 +24,7 @@ def find_faulty_steps(
 
     - it differs in length from the odometry increment, corrected for scale, by more than ``n_sigmas`` times
       the robust standard deviation of this difference over the moving vehicle (and more than
-      ``MIN_LIMIT_M``), or by more than half of that where the ground truth stands still, and
+      ``MIN_LIMIT_M``), or by more than half of that where the ground truth has stopped, and
     - the odometry increment differs by less than half of that from the median of its neighbours, so that it
       is not an outlier of the odometry.
 
@@ -73,7 +73,7 @@ def find_faulty_scans(truth: np.ndarray, increments: np.ndarray, *, max_gap: int
     """Mark the scans whose ground truth is faulty: those at a faulty step,
     and those shortly between two of them.
 
-    Between a segment in which the ground truth stands still and the leap that ends it, single steps may look
+    Between a segment in which the ground truth has stopped and the jump that ends it, single steps may look
     right while the poses are still wrong.
 
     Parameters

@@ -64,7 +64,7 @@ def start() -> Iterator[Callable[..., subprocess.Popen]]:
 
 
 def train(root: Path, profile: str = "mein Profil.yaml", *words: str) -> list[str | Path]:
-    """Give the command that runs the rule of chapter 04 alone."""
+    """Return the command that runs the rule of chapter 4 alone."""
     python = [root / "python", "-m", "snakemake", "--snakefile", ROOT / "Snakefile", "-c1", "--nolock"]
     weights = root / "my results/pix2pix/generator.safetensors"
     return [*python, "--allowed-rules", "pix2pix", "--configfile", profile, *words, "--", weights]

@@ -187,7 +187,7 @@ def plan_trajectory(
     n_stops : int
         Junctions at which the car waits for 2 to 5 s.
     stand_s : float
-        How long the car stands still after the first scan began [s].
+        Time for which the vehicle is stationary after the first scan began [s].
 
     Returns
     -------
