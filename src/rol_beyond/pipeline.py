@@ -62,7 +62,7 @@ class RobustLocalizer:
         points, increment = self.front_end(scan), None
         found = self.odometry.step(points, scan.stamp_us)
         if found is not None:
-            # The points, not the image: a network runs once, and the errors on real scans are not larger.
+            # The points, not the image: a network runs once, and the RMSE on real scans is not larger.
             points, increment = self.odometry.deskew(points, found.twist), found.T_target_source
         used = points
         if self.density_radius_m:
